@@ -1,0 +1,59 @@
+"""The one decorator of every kernel: compiled and cached, or plain Python as the slow oracle. It holds no kernel.
+
+The cache folder is keyed on a hash of the package's sources, since a compiled caller goes stale silently when a callee
+in another file changes. It is set around the decoration only, so that the host process keeps its own cache setting.
+``HALTERE_JIT=0`` gives plain Python (debugger, oracle); ``HALTERE_CACHE_DIR`` moves the cache.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import os
+from collections.abc import Callable
+from pathlib import Path
+from typing import TypeVar, cast
+
+F = TypeVar("F", bound=Callable[..., object])
+
+__all__ = ["COMPILED", "cache_folder", "jit"]
+
+#: False under ``HALTERE_JIT=0``.
+COMPILED = os.environ.get("HALTERE_JIT", "1") != "0"
+
+#: Packages whose sources are compiled; a change in any of them makes a new cache folder.
+_KERNEL_ROOMS = ("core", "filter", "strapdown", "aids", "diagnosis", "estimators", "_jit.py")
+
+
+def cache_folder() -> Path:
+    """Folder of the compiled kernels of exactly these sources."""
+    here = Path(__file__).parent
+    digest = hashlib.sha256()
+    for room in _KERNEL_ROOMS:
+        for path in sorted([here / room] if room.endswith(".py") else (here / room).glob("*.py")):
+            digest.update(path.name.encode())
+            digest.update(path.read_bytes())
+    root = os.environ.get("HALTERE_CACHE_DIR") or os.path.join(
+        os.environ.get("XDG_CACHE_HOME") or os.path.expanduser("~/.cache"), "haltere"
+    )
+    return Path(root) / digest.hexdigest()[:16]
+
+
+if COMPILED:
+    import numba
+
+    _FOLDER = str(cache_folder())
+
+    def jit(function: F) -> F:
+        """Compile a kernel on first call, from the cache where it is there."""
+        before = numba.config.CACHE_DIR  # type: ignore[attr-defined]
+        numba.config.CACHE_DIR = _FOLDER  # type: ignore[attr-defined]
+        try:
+            return cast(F, numba.njit(cache=True, error_model="numpy")(function))
+        finally:
+            numba.config.CACHE_DIR = before  # type: ignore[attr-defined]
+
+else:
+
+    def jit(function: F) -> F:
+        """Leave a kernel as plain Python."""
+        return function

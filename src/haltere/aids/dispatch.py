@@ -1,0 +1,90 @@
+"""Which measurement goes to which aid: one ``if`` line a sensor, and when pseudo-measurements are due. It decides nothing else."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from haltere._jit import jit
+from haltere.aids import barometer, fake, gnss, magnetometer, rest, zero_rate, zero_velocity
+from haltere.aids.fusing import NOTHING, Offer, fuse_offer
+from haltere.aids.record import (
+    BAROMETER,
+    FAKE_POSITION,
+    FAKE_VELOCITY,
+    GNSS_POSITION,
+    GNSS_VELOCITY,
+    MAGNETOMETER,
+    N_QUEUED,
+    ZERO_RATE,
+    ZERO_VELOCITY,
+)
+from haltere.core.rotation import Vec
+from haltere.filter.queue import pop_due
+
+__all__ = ["N_SENSORS", "due", "fuse_all", "offer_of"]
+
+N_SENSORS = 8
+
+
+@jit
+def offer_of(s: Any, prm: Any, sensor: int, m: Any, aids: Any, dt: float, w: Vec, resting: bool) -> Offer:
+    """What a sensor has to say: of the queued measurement ``m``, or of itself where it is a pseudo-sensor."""
+    if sensor == GNSS_VELOCITY:
+        return gnss.offer_velocity(s, prm, m)
+    if sensor == GNSS_POSITION:
+        return gnss.offer_position(s, prm, m, aids, dt)
+    if sensor == BAROMETER:
+        return barometer.offer(s, prm, m, aids)
+    if sensor == MAGNETOMETER:
+        return magnetometer.offer(s, prm, m, aids)
+    if sensor == ZERO_VELOCITY:
+        return zero_velocity.offer(s, prm)
+    if sensor == ZERO_RATE:
+        return zero_rate.offer(s, prm, w)
+    if sensor == FAKE_VELOCITY:
+        return fake.offer_velocity(s, prm)
+    if sensor == FAKE_POSITION:
+        return fake.offer_position(s, prm, resting)
+    return NOTHING
+
+
+@jit
+def due(s: Any, prm: Any, sensor: int, w: Vec, f: Vec) -> bool:
+    """Is this pseudo-measurement to be made now? Its clock (10 Hz at rest, 5 Hz fake), its switch, its conditions."""
+    a = s.aid[sensor]
+    if s.t < a.t_due:
+        return False
+    at_rest = sensor == ZERO_VELOCITY or sensor == ZERO_RATE
+    a.t_due = s.t + (0.1 if at_rest else 0.2) - 1e-6
+    if sensor == ZERO_VELOCITY:
+        return prm.aid_zero_velocity > 0.0 and rest.at_rest(s, prm, w, f)
+    if sensor == ZERO_RATE:
+        return prm.aid_zero_rate > 0.0 and rest.at_rest(s, prm, w, f)
+    if sensor == FAKE_VELOCITY:
+        return prm.aid_fake_velocity > 0.0
+    if fake.position_is_lost(s):
+        return prm.aid_fake_position > 0.0
+    for i in range(3):
+        s.anchor[i] = s.p[i]
+    return False
+
+
+@jit
+def fuse_all(s: Any, prm: Any, aids: Any, dt: float, w: Vec, f: Vec) -> None:
+    """Fuse every queued measurement valid at or before the state's time, sensor by sensor, then the pseudo-measurements due."""
+    sensor = 0
+    while sensor < N_SENSORS:
+        i, t = 0, s.t
+        if sensor < N_QUEUED:
+            i = pop_due(s, sensor, s.t)
+            if i >= 0:
+                t = s.ring[sensor, i].t
+                s.aid[sensor].t_offered = t
+        elif not due(s, prm, sensor, w, f):
+            i = -1
+        if i >= 0:
+            m = s.ring[sensor if sensor < N_QUEUED else 0, i]
+            resting = s.rest.still == 1 and s.rest.moved == 0
+            fuse_offer(s, aids, t, sensor, offer_of(s, prm, sensor, m, aids, dt, w, resting))
+        if i < 0 or sensor >= N_QUEUED:  # a queue is emptied before the next sensor
+            sensor += 1

@@ -1,0 +1,145 @@
+"""What every aid does with its h, H and R: test, fuse, deweight or refuse, and leave one record a component. It knows no sensor."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+
+from haltere._jit import jit
+from haltere.aids.record import (
+    DEWEIGHTED,
+    E_TIMEOUT,
+    FUSED,
+    R_INNOVATION,
+    R_NONE,
+    R_TIMEOUT,
+    REJECTED,
+    event,
+    record,
+)
+from haltere.core.rotation import Vec, dcm
+from haltere.filter.gates import ABSENT, inflation, joint_nis, optimal_gain
+from haltere.filter.update import NONE, Row, apply, innovation, project, symmetrise, variance
+from haltere.strapdown.propagate import inject
+
+__all__ = ["NOTHING", "NO_GATE", "NO_TIMEOUT", "Offer", "fuse_offer", "judge", "unit_rows"]
+
+#: What an aid has to say of one measurement, the same shape for all, so that one machine-code version fuses them all:
+#: number of components (0: nothing to fuse), code of the first, observations z, their predictions h, variances r, rows of H,
+#: gate [sigma], timeout [s], reason to refuse it whatever the test says, and whether only the turn about the vertical is kept.
+Offer = tuple[int, int, Vec, Vec, Vec, tuple[Row, Row, Row], float, float, int, bool]
+
+NO_GATE, NO_TIMEOUT = 1e9, 1e18
+#: What ``started`` says of a sensor.
+RUNNING, FORCED = 1, 3
+ZERO, ONE, THREE = (np.int64(i) for i in (0, 1, 3))
+ZEROS = (0.0, 0.0, 0.0)
+#: An offer of nothing.
+NOTHING = (ZERO, ZERO, ZEROS, ZEROS, ZEROS, ((NONE, NONE, NONE), (NONE, NONE, NONE), (NONE, NONE, NONE)), 1.0, 1.0, ZERO, False)
+
+
+@jit
+def unit_rows(column: int) -> tuple[Row, Row, Row]:
+    """Rows that pick the three states from this column on."""
+    return (
+        ((column, (1.0, 0.0, 0.0)), NONE, NONE),
+        ((column, (0.0, 1.0, 0.0)), NONE, NONE),
+        ((column, (0.0, 0.0, 1.0)), NONE, NONE),
+    )
+
+
+@jit
+def judge(s: Any, sensor: int, t: float, ratio: float, timeout: float, reason: int) -> tuple[int, int, float]:
+    """Status, reason and weight of a measurement with this test ratio, and the sensor's memory brought up to date.
+
+    Continues while the ratio is at most one. After ``timeout`` [s] of refusals by the innovation the measurement is let in
+    with its variance inflated until the ratio is one: the state is drawn to it without a jump. ``reason`` other than
+    `R_NONE` refuses it whatever the ratio.
+    """
+    a = s.aid[sensor]
+    if reason != R_NONE:
+        a.n_rejected += 1
+        return REJECTED, reason, 0.0
+    if ratio <= 1.0:
+        a.t_passed = t
+        a.started = RUNNING
+        a.n_fused += 1
+        return FUSED, R_NONE, 1.0
+    if t - a.t_passed > timeout:
+        if a.started != FORCED:
+            event(s, t, E_TIMEOUT, sensor, t - a.t_passed)
+            a.started = FORCED
+        a.n_fused += 1
+        return DEWEIGHTED, R_TIMEOUT, 1.0 / ratio
+    a.n_rejected += 1
+    return REJECTED, R_INNOVATION, 0.0
+
+
+@jit
+def fuse_offer(s: Any, aids: Any, t: float, sensor: int, offer: Offer) -> None:
+    """Test the components of an offer together (NIS/gate²), fuse them one after the other, and record them.
+
+    Parameters
+    ----------
+    s, aids
+        State record and aid records.
+    t
+        Valid time [s].
+    sensor
+        Code.
+    offer
+        What the aid has to say, see `Offer`.
+    """
+    n, component, z, h, r, H, gate, timeout, reason, vertical = offer
+    if n == 0:
+        return
+    H0, H1, H2 = H
+    ok0, ok1, ok2 = z[0] == z[0], n > 1 and z[1] == z[1], n > 2 and z[2] == z[2]
+    e = (z[0] - h[0] if ok0 else 0.0, z[1] - h[1] if ok1 else 0.0, z[2] - h[2] if ok2 else 0.0)
+    r = (r[0] if ok0 else ABSENT, r[1] if ok1 else ABSENT, r[2] if ok2 else ABSENT)
+    if n == 1:
+        project(s, H0)
+        s00 = variance(s, H0) + r[0]
+        nis, s_ii = e[0] * e[0] / s00, (s00, s00, s00)
+    else:
+        nis, s_ii = joint_nis(s, H0, H1, H2, e, r)
+    ratio = nis / (gate * gate)
+    status, reason, weight = judge(s, sensor, t, ratio, timeout, reason)
+    if status == DEWEIGHTED:
+        r = (inflation(nis, gate, s_ii[0], r[0]), inflation(nis, gate, s_ii[1], r[1]), inflation(nis, gate, s_ii[2], r[2]))
+    if status != REJECTED:
+        for i in range(3):
+            row, r_i, e_i, ok = H0, r[0], e[0], ok0
+            if i == 1:
+                row, r_i, e_i, ok = H1, r[1], e[1], ok1
+            elif i == 2:
+                row, r_i, e_i, ok = H2, r[2], e[2], ok2
+            if ok:
+                optimal_gain(s, row, r_i)
+                if vertical:
+                    project_gain(s)
+                apply(s, row, r_i, innovation(s, row, e_i))
+        inject(s)
+        symmetrise(s)
+    for i in range(n):
+        if z[i] == z[i]:
+            record(s, aids, t, sensor, component + i, z[i], e[i], math.sqrt(s_ii[i]), ratio, weight, status, reason)
+
+
+@jit
+def project_gain(s: Any) -> None:
+    """Keep of the gain in ``s.k`` only what turns about the vertical: K_θ <- d (dᵀ K_θ), K_bg likewise, the rest zero.
+
+    d = Cᵀ e3 is the vertical in the body frame (theory-amendments.md §1).
+    """
+    d = dcm((s.q[0], s.q[1], s.q[2], s.q[3]))[2]
+    k = s.k
+    a = d[0] * k[0] + d[1] * k[1] + d[2] * k[2]
+    b = d[0] * k[9] + d[1] * k[10] + d[2] * k[11]
+    for i in range(s.P.shape[0]):
+        k[i] = 0.0
+    for i in range(3):
+        k[i] = a * d[i]
+        k[9 + i] = b * d[i]

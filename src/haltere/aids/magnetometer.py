@@ -1,0 +1,135 @@
+"""Magnetometer as a heading that leaves tilt alone (default), or as three axes: h, H, R, tests, start. No calibration."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+from haltere._jit import jit
+from haltere.aids.fusing import NOTHING, ONE, RUNNING, THREE, Offer
+from haltere.aids.record import (
+    C_HEADING,
+    C_MAG,
+    E_RESET,
+    FUSED,
+    MAGNETOMETER,
+    R_DIP,
+    R_HORIZONTAL,
+    R_NONE,
+    R_START,
+    R_STRENGTH,
+    event,
+    record,
+)
+from haltere.core.rotation import Mat, Vec, dcm, mat_vec, norm, quat_from_rotvec, quat_mul, quat_unit, tmat_vec, wrap
+from haltere.filter.update import NONE, symmetrise
+from haltere.strapdown.layout import THETA
+
+__all__ = ["field_n", "heading_row", "learn_field", "offer", "reset_yaw", "yaw_variance"]
+
+
+@jit
+def field_n(s: Any) -> Vec:
+    """Reference field [uT] in NED from declination, dip and strength."""
+    d, i, h = s.field[0], s.field[1], s.field[2]
+    return (h * math.cos(i) * math.cos(d), h * math.cos(i) * math.sin(d), h * math.sin(i))
+
+
+@jit
+def learn_field(s: Any, m_n: Vec, declination: float) -> None:
+    """Take dip and strength of the reference from a measured field in NED, where no model of the field is known."""
+    horizontal = math.sqrt(m_n[0] * m_n[0] + m_n[1] * m_n[1])
+    s.field[0], s.field[1], s.field[2] = declination, math.atan2(m_n[2], horizontal), norm(m_n)
+    s.has_field = 1
+
+
+@jit
+def heading_row(C: Mat, declination: float, dip: float) -> Vec:
+    """Derivative of the tilt-levelled compass heading against δθ: (e3 - tan I [cos D, sin D, 0])ᵀ C (theory-amendments.md §1)."""
+    t = math.tan(dip)
+    a, b = -t * math.cos(declination), -t * math.sin(declination)
+    return (a * C[0][0] + b * C[1][0] + C[2][0], a * C[0][1] + b * C[1][1] + C[2][1], a * C[0][2] + b * C[1][2] + C[2][2])
+
+
+@jit
+def yaw_variance(s: Any, C: Mat) -> float:
+    """Variance of the attitude error about the vertical [rad^2]."""
+    P, d = s.P, C[2]
+    total = 0.0
+    for i in range(3):
+        for j in range(3):
+            total += d[i] * P[i, j] * d[j]
+    return total
+
+
+@jit
+def reset_yaw(s: Any, delta: float, sd: float) -> None:
+    """Turn the attitude by ``delta`` [rad] about the vertical; the error about it becomes ``sd`` and independent of the rest."""
+    q = quat_unit(quat_mul(quat_from_rotvec((0.0, 0.0, delta)), (s.q[0], s.q[1], s.q[2], s.q[3])))
+    s.q[0], s.q[1], s.q[2], s.q[3] = q
+    C = dcm(q)
+    d = C[2]
+    P = s.P
+    n = s.P.shape[0]
+    for j in range(n):  # P <- (I - d dᵀ) P (I - d dᵀ) on the attitude rows, then the new variance along d
+        a = d[0] * P[0, j] + d[1] * P[1, j] + d[2] * P[2, j]
+        for i in range(3):
+            P[i, j] -= d[i] * a
+    for j in range(n):
+        a = d[0] * P[j, 0] + d[1] * P[j, 1] + d[2] * P[j, 2]
+        for i in range(3):
+            P[j, i] -= d[i] * a
+    for i in range(3):
+        for j in range(3):
+            P[i, j] += sd * sd * d[i] * d[j]
+    symmetrise(s)
+
+
+@jit
+def offer(s: Any, prm: Any, m: Any, aids: Any) -> Offer:
+    """Magnetometer sample ``m.z`` [uT, body]. Starts by setting yaw where that is unknown, then heading or three axes."""
+    z = (m.z[0], m.z[1], m.z[2])
+    C = dcm((s.q[0], s.q[1], s.q[2], s.q[3]))
+    mu = mat_vec(C, z)
+    a = s.aid[MAGNETOMETER]
+    horizontal = math.sqrt(mu[0] * mu[0] + mu[1] * mu[1])
+    if s.has_field == 0:
+        learn_field(s, mu, s.field[0])
+    reason = R_NONE
+    if abs(norm(z) / s.field[2] - 1.0) > prm.field_tolerance_strength:
+        reason = R_STRENGTH
+    elif abs(math.atan2(mu[2], horizontal) - s.field[1]) > prm.field_tolerance_dip:
+        reason = R_DIP
+    elif horizontal < 0.2 * s.field[2] * math.cos(s.field[1]):
+        reason = R_HORIZONTAL
+    heading = wrap(s.field[0] - math.atan2(mu[1], mu[0]))
+    if a.started == 0 and reason == R_NONE:
+        a.started = RUNNING
+        a.t_passed = m.t
+        if yaw_variance(s, C) > 0.25:  # above 30 deg linearisation means little: set, do not fuse
+            reset_yaw(s, heading, prm.init_yaw_compass)
+            event(s, m.t, E_RESET, MAGNETOMETER, heading)
+            record(s, aids, m.t, MAGNETOMETER, C_HEADING, heading, 0.0, prm.init_yaw_compass, 0.0, 1.0, FUSED, R_START)
+            return NOTHING
+    if prm.aid_magnetometer == 2.0:
+        return offer_axes(s, prm, C, z, reason)
+    sd = prm.noise_magnetometer / max(horizontal, 1e-3)
+    row = ((THETA, heading_row(C, s.field[0], s.field[1])), NONE, NONE)
+    r = sd * sd
+    return (
+        ONE, C_HEADING, (heading, 0.0, 0.0), (0.0, 0.0, 0.0), (r, r, r), (row, row, row), prm.gate_magnetometer, prm.timeout_magnetometer,
+        reason, True,
+    )  # fmt: skip
+
+
+@jit
+def offer_axes(s: Any, prm: Any, C: Mat, z: Vec, reason: int) -> Offer:
+    """Three axes: h = Cᵀ m_n, H_θ = [Cᵀ m_n]× (theory.md §2.1, §3.6)."""
+    h = tmat_vec(C, field_n(s))
+    r = prm.noise_magnetometer * prm.noise_magnetometer
+    H = (
+        ((THETA, (0.0, -h[2], h[1])), NONE, NONE),
+        ((THETA, (h[2], 0.0, -h[0])), NONE, NONE),
+        ((THETA, (-h[1], h[0], 0.0)), NONE, NONE),
+    )
+    return THREE, C_MAG, z, h, (r, r, r), H, prm.gate_magnetometer, prm.timeout_magnetometer, reason, False

@@ -1,0 +1,81 @@
+"""The one record of a measurement update, and the words behind its codes. Everything downstream reads these records."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from haltere._jit import jit
+
+__all__ = ["AID_RECORD", "COMPONENTS", "EVENTS", "REASONS", "SENSORS", "STATUSES", "event", "record"]
+
+#: Codes are NumPy integers, since a plain one would compile a version of every function it is passed to.
+#: Sensor codes, and indices of the filter's memory of each sensor. The first four arrive from outside and are queued.
+GNSS_VELOCITY, GNSS_POSITION, BAROMETER, MAGNETOMETER, ZERO_VELOCITY, ZERO_RATE, FAKE_POSITION, FAKE_VELOCITY = (np.int64(i) for i in range(8))
+N_QUEUED = 4
+SENSORS = ("gnss", "gnss", "barometer", "magnetometer", "zero_velocity", "zero_rate", "fake_position", "fake_velocity")
+
+COMPONENTS = ("vel_n", "vel_e", "vel_d", "pos_n", "pos_e", "pos_d", "altitude", "heading", "mag_x", "mag_y", "mag_z", "rate_x", "rate_y", "rate_z")
+C_VEL, C_POS, C_ALTITUDE, C_HEADING, C_MAG, C_RATE = (np.int64(i) for i in (0, 3, 6, 7, 8, 11))
+
+STATUSES = ("fused", "deweighted", "rejected", "held")
+FUSED, DEWEIGHTED, REJECTED, HELD = (np.int64(i) for i in range(4))
+
+REASONS = ("", "innovation", "timeout", "start", "field strength", "dip", "no horizontal field", "alignment")
+R_NONE, R_INNOVATION, R_TIMEOUT, R_START, R_STRENGTH, R_DIP, R_HORIZONTAL, R_ALIGNMENT = (np.int64(i) for i in range(8))
+
+EVENTS = ("aligned", "reset", "diverged", "realigned", "gap", "recovered", "timeout")
+E_ALIGNED, E_RESET, E_DIVERGED, E_REALIGNED, E_GAP, E_RECOVERED, E_TIMEOUT = (np.int64(i) for i in range(7))
+
+AID_RECORD = np.dtype(
+    [
+        ("t", "f8"),
+        ("observation", "f8"),
+        ("innovation", "f8"),
+        ("innovation_sd", "f8"),
+        ("test_ratio", "f8"),
+        ("weight", "f8"),
+        ("sensor", "u1"),
+        ("component", "u1"),
+        ("status", "u1"),
+        ("reason", "u1"),
+    ],
+    align=True,
+)
+
+
+@jit
+def record(
+    s: Any, aids: Any, t: float, sensor: int, component: int, observation: float, innovation: float, sd: float, ratio: float,
+    weight: float, status: int, reason: int,
+) -> None:
+    """Append one record; without room it is counted, not lost silently."""
+    i = s.n_aids
+    if i < len(aids):
+        a = aids[i]
+        a.t = t
+        a.observation = observation
+        a.innovation = innovation
+        a.innovation_sd = sd
+        a.test_ratio = ratio
+        a.weight = weight
+        a.sensor = sensor
+        a.component = component
+        a.status = status
+        a.reason = reason
+        s.n_aids = i + 1
+    else:
+        s.n_aids_lost += 1
+
+
+@jit
+def event(s: Any, t: float, code: int, sensor: int, value: float) -> None:
+    """Append one event of the filter; without room it is counted."""
+    i = s.n_events
+    if i < len(s.event):
+        e = s.event[i]
+        e.t, e.code, e.sensor, e.value = t, code, sensor, value
+        s.n_events = i + 1
+    else:
+        s.n_events_lost += 1

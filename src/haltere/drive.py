@@ -1,0 +1,279 @@
+"""`run`: a whole log through an estimator, the only loop over a log. It computes no formula of its own."""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from haltere.aids.record import AID_RECORD, COMPONENTS, EVENTS, N_QUEUED, REASONS, SENSORS, STATUSES
+from haltere.errors import HaltereError, UsageError
+from haltere.estimators import step as kernels
+from haltere.estimators.base import InitialState, new_state
+from haltere.estimators.inputs import Measurements, configure, imu_arrays, measurements, parameters
+from haltere.estimators.registry import SPECIFICATIONS
+from haltere.flight.config import Config
+from haltere.flight.door import Checked, check
+from haltere.flight.local import geodetic_from_local
+from haltere.flight.log import FlightLog
+from haltere.flight.solution import Solution
+from haltere.metrics.summary import summarise
+
+__all__ = ["run"]
+
+FloatArray = NDArray[np.float64]
+#: IMU samples between two looks at progress, and room for aid records between two drains.
+CHUNK, AID_ROOM = 20000, 60000
+
+
+def run(
+    flight: FlightLog,
+    estimator: str = "navigator",
+    *,
+    preset: str = "default",
+    config: Config | Mapping[str, Any] | str | Path | None = None,
+    set: Mapping[str, Any] | None = None,
+    vehicle: str | Path | None = None,
+    smooth: bool = False,
+    rate: float | None = None,
+    initial: InitialState | None = None,
+    progress: Callable[[float], None] | None = None,
+) -> Solution:
+    """Run an estimator over a flight.
+
+    Parameters
+    ----------
+    flight
+        The log. Streams ``onboard`` and ``truth`` are compared with afterwards and never read by the estimator.
+    estimator
+        ``navigator`` or ``ahrs``.
+
+    Other Parameters
+    ----------------
+    preset
+        Named set of parameters.
+    config
+        Configuration file, `Config` or mapping of keys.
+    set
+        Single keys to change, over everything else.
+    vehicle
+        Vehicle file. No estimator uses one yet.
+    smooth
+        Run the smoother too. Not there yet.
+    rate
+        Rows a second of the solution; decimates, does not interpolate.
+    initial
+        State to begin from instead of aligning.
+    progress
+        Called with the fraction done, between chunks.
+
+    Returns
+    -------
+    Solution
+        Row t is the state at t after every measurement valid at or before t, whenever it arrived. Rows begin at alignment.
+
+    Raises
+    ------
+    HaltereError
+        The log cannot be navigated on, or the filter never aligned; the message says why and what to do.
+    UsageError
+        Unknown estimator, preset or key, or something asked for that is not there.
+    """
+    if smooth:
+        raise UsageError("a filter run", "smooth=True", "run", "the smoother is not part of this version")
+    if vehicle is not None:
+        raise UsageError("no vehicle file", str(vehicle), "run", f"{estimator} does not use a vehicle model in this version")
+    if rate is not None and not (math.isfinite(rate) and rate > 0.0):
+        raise UsageError("a positive number of rows a second", repr(rate), "--rate")
+    began = time.perf_counter()
+    blind = flight.without("onboard", "truth")
+    checked = check(blind, upright=estimator != "ahrs")
+    resolved = configure(blind, checked, estimator, preset, config, set)
+    specification = SPECIFICATIONS[estimator]
+    t, gyro, accel = imu_arrays(blind, checked)
+    offered = measurements(blind, checked, resolved)
+    prepared = time.perf_counter()
+
+    S, prm = new_state(resolved, initial), parameters(resolved)
+    rows = np.empty((int(kernels.row_count(S["baro"].shape[1])), len(t)))
+    cov = np.empty((kernels.COVARIANCE_ROWS, int((t[-1] - t[0]) / 0.1) + 64 if len(t) else 1))
+    aids_parts, events = _loop(S, prm, t, gyro, accel, offered, rows, cov, progress)
+    filtered = time.perf_counter()
+
+    n = int(S["n_rows"][0])
+    if n == 0:
+        raise HaltereError(
+            "an alignment (a second at rest, or motion with GNSS velocity, or five seconds of any motion)",
+            f"{t[-1] - t[0]:.1f} s of IMU that allowed none", f"{flight.meta.name or 'flight'}: initial alignment",
+            "give the estimator a longer stretch of data, or an initial state",
+        )  # fmt: skip
+    table = _table(rows, n, S, specification.POSITION)
+    if rate is not None:
+        keep = _decimate(table["t"], rate)
+        table = {name: column[keep] for name, column in table.items()}
+    solution = Solution(table, _aid_table(aids_parts), events, resolved, {}, _covariance(cov, int(S["n_cov"][0])))
+    summarise(solution, flight, _facts(flight, checked, S, offered, n, t, began, prepared, filtered))
+    return solution
+
+
+def _loop(
+    S: NDArray[np.void], prm: NDArray[np.void], t: FloatArray, gyro: FloatArray, accel: FloatArray, m: Measurements, rows: FloatArray,
+    cov: FloatArray, progress: Callable[[float], None] | None,
+) -> tuple[list[NDArray[np.void]], list[dict[str, Any]]]:
+    """Drive the compiled step over the whole log, draining records and events between chunks."""
+    aids = np.empty(AID_ROOM, AID_RECORD)
+    parts: list[NDArray[np.void]] = []
+    events: list[dict[str, Any]] = []
+    i = j = 0
+    while i < len(t):
+        i, j = kernels.run_chunk(S, prm, t, gyro, accel, i, min(i + CHUNK, len(t)), m.kind, m.t, m.z, m.r, j, rows, cov, aids)
+        _drain(S, aids, parts, events)
+        if progress is not None:
+            progress(i / len(t))
+    kernels.flush(S, prm, rows, cov, aids)
+    _drain(S, aids, parts, events)
+    return parts, events
+
+
+def _drain(S: NDArray[np.void], aids: NDArray[np.void], parts: list[NDArray[np.void]], events: list[dict[str, Any]]) -> None:
+    """Move records and events out of the buffers of fixed size."""
+    if S["n_aids"][0]:
+        parts.append(aids[: int(S["n_aids"][0])].copy())
+        S["n_aids"] = 0
+    for e in S["event"][0, : int(S["n_events"][0])]:
+        kind = EVENTS[int(e["code"])]
+        sensor = SENSORS[int(e["sensor"])] if kind in ("reset", "timeout", "recovered") else ("imu" if kind == "gap" else "filter")
+        events.append(_event(kind, sensor, float(e["t"]), float(e["value"])))
+    S["n_events"] = 0
+
+
+def _event(kind: str, sensor: str, t: float, value: float) -> dict[str, Any]:
+    evidence = {
+        "aligned": "initial alignment " + {1: "at rest", 2: "in motion, from GNSS velocity", 3: "from gravity alone"}.get(int(value), ""),
+        "realigned": "aligned anew " + {1: "at rest", 2: "in motion, from GNSS velocity", 3: "from gravity alone"}.get(int(value), ""),
+        "reset": "first measurement sets the state",
+        "timeout": f"refused for {value:.1f} s, let in again at the gate's edge",
+        "gap": f"{value:.2f} s without IMU samples",
+        "diverged": "state or covariance not finite or not positive",
+    }.get(kind, kind)
+    return {
+        "sensor": sensor, "axis": None, "kind": kind, "t_onset": t, "t_detected": t, "t_isolated": None, "t_recovered": None,
+        "candidates": [], "statistic": value, "threshold": None, "evidence": evidence,
+    }  # fmt: skip
+
+
+def _table(rows: FloatArray, n: int, S: NDArray[np.void], position: bool) -> dict[str, FloatArray]:
+    """Columns of the solution from the raw output rows; variances become standard deviations in place."""
+    baro = S["baro"].shape[1]
+    rows = rows[:, :n]
+    out = {"t": rows[0]} | {f"q_{a}": rows[1 + k] for k, a in enumerate("wxyz")}
+    sd_roll, sd_pitch, sd_yaw = _euler_sd(rows[1:5], rows[17:23])
+    np.sqrt(rows[23:35], out=rows[23:35])
+    if position:
+        out |= {f"vel_{a}": rows[5 + k] for k, a in enumerate("ned")}
+        out |= {f"pos_{a}": rows[8 + k] for k, a in enumerate("ned")}
+        if S["has_origin"][0]:
+            out["lat"], out["lon"], out["alt"] = geodetic_from_local(rows[8], rows[9], rows[10], *(float(x) for x in S["origin"][0]))
+    out |= {f"gyro_bias_{a}": rows[11 + k] for k, a in enumerate("xyz")}
+    if position:
+        out |= {f"accel_bias_{a}": rows[14 + k] for k, a in enumerate("xyz")}
+        if baro:
+            out["baro_bias"] = rows[35]
+    out |= {"sd_roll": sd_roll, "sd_pitch": sd_pitch, "sd_yaw": sd_yaw}
+    if position:
+        out |= {f"sd_vel_{a}": rows[23 + k] for k, a in enumerate("ned")}
+        out |= {f"sd_pos_{a}": rows[26 + k] for k, a in enumerate("ned")}
+    out |= {f"sd_gyro_bias_{a}": rows[29 + k] for k, a in enumerate("xyz")}
+    if position:
+        out |= {f"sd_accel_bias_{a}": rows[32 + k] for k, a in enumerate("xyz")}
+        if baro:
+            np.sqrt(rows[36], out=rows[36])
+            out["sd_baro_bias"] = rows[36]
+    return out
+
+
+def _euler_sd(q: FloatArray, P: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """1 sigma of roll, pitch, yaw [rad] from the body-frame error covariance, first order, at most pi.
+
+    δ(roll, pitch, yaw) = W δθ with W = [1, sinφ tanθ, cosφ tanθ; 0, cosφ, -sinφ; 0, sinφ/cosθ, cosφ/cosθ].
+    ``q`` is (4, n), ``P`` the upper triangle (6, n).
+    """
+    w, x, y, z = q
+    s2, c2 = 2.0 * (y * z + w * x), w * w - x * x - y * y + z * z  # cosθ sinφ, cosθ cosφ
+    cos2 = np.maximum(s2 * s2 + c2 * c2, 1e-12)
+    sin_pitch = 2.0 * (w * y - x * z)
+    p_s = P[3] * s2 * s2 + 2.0 * P[4] * s2 * c2 + P[5] * c2 * c2
+    yaw = p_s / (cos2 * cos2)
+    k = sin_pitch / cos2
+    roll = P[0] + 2.0 * k * (P[1] * s2 + P[2] * c2) + k * k * p_s
+    pitch = (P[3] * c2 * c2 - 2.0 * P[4] * s2 * c2 + P[5] * s2 * s2) / cos2
+    sd = [np.minimum(np.sqrt(np.maximum(v, 0.0)), math.pi) for v in (roll, pitch, yaw)]
+    return sd[0], sd[1], sd[2]
+
+
+def _decimate(t: FloatArray, rate: float) -> NDArray[np.bool_]:
+    """First row of each interval of 1/rate."""
+    slot = np.floor((t - t[0]) * rate + 1e-6)
+    return np.r_[True, np.diff(slot) > 0.0]
+
+
+def _aid_table(parts: list[NDArray[np.void]]) -> dict[str, NDArray[Any]]:
+    """Columns of ``aids.parquet``, in order of valid time."""
+    a = np.concatenate(parts) if parts else np.empty(0, AID_RECORD)
+    a = a[np.argsort(a["t"], kind="stable")]
+    out: dict[str, NDArray[Any]] = {"t": np.ascontiguousarray(a["t"])}
+    out["sensor"] = np.array(SENSORS)[a["sensor"]]
+    out["component"] = np.array(COMPONENTS)[a["component"]]
+    for name in ("observation", "innovation", "innovation_sd", "test_ratio", "weight"):
+        out[name] = np.ascontiguousarray(a[name])
+    out["status"] = np.array(STATUSES)[a["status"]]
+    out["reason"] = np.array(REASONS)[a["reason"]]
+    return out
+
+
+def _covariance(cov: FloatArray, n: int) -> dict[str, FloatArray]:
+    """Core blocks (m, 3, 3) by name."""
+    out = {"t": cov[0, :n].copy()}
+    where = np.array([[0, 1, 2], [1, 3, 4], [2, 4, 5]])
+    for b, name in enumerate(("attitude", "velocity", "position", "gyro_bias", "accel_bias")):
+        out[name] = np.ascontiguousarray(cov[1 + 6 * b : 7 + 6 * b, :n].T[:, where])
+    if np.isfinite(cov[31, :n]).any():
+        out["baro_bias"] = np.ascontiguousarray(cov[31, :n].reshape(-1, 1, 1))
+    return out
+
+
+def _facts(
+    flight: FlightLog, checked: Checked, S: NDArray[np.void], m: Measurements, n: int, t: FloatArray, began: float, prepared: float,
+    filtered: float,
+) -> dict[str, Any]:
+    """What only the run knows, for the summary."""
+    lost: dict[str, dict[str, int]] = {k: dict(v) for k, v in checked.discarded.items()}
+
+    def count(stream: str, reason: str, number: int) -> None:
+        if number:
+            reasons = lost.setdefault(stream, {})
+            reasons[reason] = reasons.get(reason, 0) + number
+
+    count("imu", "before alignment", int(S["n_unaligned"][0]))
+    count("imu", "refused by the filter", int(S["n_bad"][0]))
+    for k in range(N_QUEUED):
+        count(SENSORS[k], "later than the fusion horizon", int(S["aid"]["n_late"][0, k]))
+        count(SENSORS[k], "queue full before the first IMU sample", int(S["aid"]["n_overflow"][0, k]))
+        after = int(S["ring_n"][0, k]) + int(np.count_nonzero((m.kind == k) & (m.t > t[-1])))
+        count(SENSORS[k], "after the last IMU sample", after)
+    warnings = list(checked.warnings)
+    if S["n_ring_full"][0]:
+        warnings.append("the fusion horizon was shortened: more IMU samples than the queue holds within the largest delay")
+    if S["n_aids_lost"][0] or S["n_events_lost"][0]:
+        warnings.append(f"{int(S['n_aids_lost'][0])} aid records and {int(S['n_events_lost'][0])} events did not fit and were lost")
+    origin = [float(x) for x in S["origin"][0]] if S["has_origin"][0] else None
+    return {
+        "origin": origin, "aligned_at": float(S["t_aligned"][0]), "discarded": lost, "warnings": warnings, "gaps": int(S["n_gaps"][0]),
+        "steps": int(S["n_steps"][0]), "rows": n, "duration": float(t[-1] - t[0]),
+        "timings": {"prepare_s": prepared - began, "filter_s": filtered - prepared},
+    }  # fmt: skip

@@ -1,0 +1,36 @@
+"""The one kind of error a user meets: what was expected, what was found, where, and what to do. It does not print or exit."""
+
+from __future__ import annotations
+
+__all__ = ["HaltereError", "UsageError"]
+
+
+class HaltereError(ValueError):
+    """Input or a run that cannot be used as it is.
+
+    Parameters
+    ----------
+    expected, found
+        What was needed and what was there instead.
+    where
+        File, stream, column and row, as far as known.
+    remedy
+        What the user can do about it.
+    """
+
+    exit_status = 1
+
+    def __init__(self, expected: str, found: str, where: str = "", remedy: str = "") -> None:
+        self.expected, self.found, self.where, self.remedy = expected, found, where, remedy
+        text = f"expected {expected}, found {found}"
+        if where:
+            text = f"{where}: {text}"
+        if remedy:
+            text = f"{text}; {remedy}"
+        super().__init__(" ".join(text.split()))
+
+
+class UsageError(HaltereError):
+    """A wrong option, key, name or preset: the command line exits with 2."""
+
+    exit_status = 2

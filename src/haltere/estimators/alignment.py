@@ -1,0 +1,265 @@
+"""Initial alignment from the data: at rest or in motion, on the ground or in the air, with or without compass and GNSS.
+
+It gathers at the fusion horizon, sample by sample, in the state record itself, so that online and offline are one code and a
+saved state may be in the middle of it (theory-amendments.md §8).
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+
+from haltere._jit import jit
+from haltere.aids import rest
+from haltere.aids.gnss import position_observation, position_variance, velocity_variance
+from haltere.aids.magnetometer import learn_field
+from haltere.aids.record import (
+    BAROMETER,
+    E_ALIGNED,
+    E_REALIGNED,
+    GNSS_POSITION,
+    GNSS_VELOCITY,
+    MAGNETOMETER,
+    N_QUEUED,
+    event,
+)
+from haltere.core.rotation import Vec, dcm, dot, euler, mat_vec, norm, quat_from_euler, quat_from_rotvec, quat_mul, quat_unit, tmat_vec, triad, wrap
+from haltere.filter.queue import pop_due
+
+__all__ = ["AT_REST", "GRAVITY_ONLY", "IN_MOTION", "begin", "gather", "level_and_compass"]
+
+AT_REST, IN_MOTION, GRAVITY_ONLY = (np.int64(i) for i in (1, 2, 3))
+#: Longest wait [s] for a compass at rest, and for GNSS or rest before gravity alone must do.
+WAIT_COMPASS, WAIT_GRAVITY = 2.0, 5.0
+#: Length of the span [s] over which motion is compared, and after which it is given up.
+SPAN, SPAN_MAX = 1.0, 3.0
+
+
+@jit
+def open_span(s: Any, t: float) -> None:
+    """Begin to integrate rotation, specific force and field from here."""
+    a = s.align
+    a.open, a.t_span, a.n_m = 1, t, 0.0
+    a.q[0], a.q[1], a.q[2], a.q[3] = 1.0, 0.0, 0.0, 0.0
+    for i in range(3):
+        a.f[i], a.m[i], a.v[i] = 0.0, 0.0, a.gnss_v[i]
+
+
+@jit
+def begin(s: Any, t: float) -> None:
+    """Forget what was gathered; the filter aligns anew."""
+    a = s.align
+    s.t = t
+    s.phase = 1
+    a.t_first, a.t_gnss_v, a.t_gnss_p, a.t_baro, a.n_baro, a.open = t, -1e9, -1e9, -1e9, 0.0, 0
+    for i in range(3):
+        a.gnss_v[i] = 0.0
+    for k in range(len(s.aid)):
+        s.aid[k].started = 0
+        s.aid[k].t_due = t
+        s.aid[k].t_passed = t
+    rest.forget(s)
+    s.rest.moved = 0
+    open_span(s, t)
+
+
+@jit
+def take_due(s: Any, prm: Any) -> bool:
+    """Take the measurements valid by now into the gathering; True when a GNSS velocity was among them."""
+    a = s.align
+    fresh = False
+    for kind in range(N_QUEUED):
+        i = pop_due(s, kind, s.t)
+        while i >= 0:
+            m = s.ring[kind, i]
+            s.aid[kind].t_offered = m.t
+            if kind == GNSS_VELOCITY:
+                if m.z[0] == m.z[0] and m.z[1] == m.z[1]:
+                    r = velocity_variance(prm, m.r)
+                    for j in range(3):
+                        known = m.z[j] == m.z[j]
+                        a.gnss_v[j] = m.z[j] if known else 0.0
+                        a.gnss_v_sd[j] = math.sqrt(r[j]) if known else 5.0
+                    a.t_gnss_v = m.t
+                    fresh = True
+            elif kind == GNSS_POSITION:
+                z = position_observation(s, m.z)
+                if z[0] == z[0] and z[2] == z[2]:
+                    r = position_variance(prm, m.r)
+                    for j in range(3):
+                        a.gnss_p[j], a.gnss_p_sd[j] = z[j], math.sqrt(r[j])
+                    a.t_gnss_p = m.t
+            elif kind == BAROMETER:
+                a.baro, a.t_baro = m.z[0], m.t
+                a.n_baro += 1.0
+            elif kind == MAGNETOMETER:
+                mu = mat_vec(dcm((a.q[0], a.q[1], a.q[2], a.q[3])), (m.z[0], m.z[1], m.z[2]))
+                a.n_m += 1.0
+                for j in range(3):
+                    a.m[j] += mu[j]
+            i = pop_due(s, kind, s.t)
+    return fresh
+
+
+@jit
+def level_and_compass(s: Any, prm: Any, f_b: Vec, a_n: Vec, m_b: Vec, has_m: bool) -> tuple[float, float, float, float, bool]:
+    """Attitude from specific force and, where it is there, the field: q_nb and whether the compass passed its tests.
+
+    Parameters
+    ----------
+    f_b
+        Mean specific force in the body frame [m/s^2].
+    a_n
+        Acceleration of the same span in NED [m/s^2], zero at rest.
+    m_b
+        Mean field in the body frame [uT].
+    has_m
+        Is there a field?
+    """
+    f_n = (a_n[0], a_n[1], a_n[2] - s.gravity)
+    # level first, with an arbitrary yaw: e1 takes the place of the field where that is along gravity
+    reference_b = (1.0, 0.0, 0.0) if abs(f_b[0]) < 0.9 * norm(f_b) else (0.0, 1.0, 0.0)
+    q = triad(f_n, (1.0, 0.0, 0.0), f_b, reference_b)
+    roll, pitch, _ = euler(q)
+    if norm(a_n) < 1e-9:
+        q = quat_from_euler(roll, pitch, 0.0)
+    passed = False
+    if has_m and norm(m_b) > 0.0:
+        mu = mat_vec(dcm(q), m_b)
+        along = dot(mu, f_n) / norm(f_n)
+        across = math.sqrt(max(0.0, dot(mu, mu) - along * along))
+        if s.has_field == 0 and across > 0.0:
+            learn_field(s, (across, 0.0, -along), s.field[0])
+        dip = math.atan2(-along, across)
+        passed = (
+            abs(norm(m_b) / s.field[2] - 1.0) < prm.field_tolerance_strength
+            and abs(dip - s.field[1]) < prm.field_tolerance_dip
+            and across > 0.2 * s.field[2] * math.cos(s.field[1])
+        )
+        # with motion the field must be compared across f_n, not across the vertical
+        d, i = s.field[0], s.field[1]
+        h = (math.cos(i) * math.cos(d), math.cos(i) * math.sin(d), math.sin(i))
+        if norm(a_n) < 1e-9:
+            q = quat_from_euler(roll, pitch, wrap(d - math.atan2(mu[1], mu[0])))
+        elif across > 0.0:
+            q = triad(f_n, h, f_b, m_b)
+    return q[0], q[1], q[2], q[3], passed
+
+
+@jit
+def start(s: Any, prm: Any, kind: int, f_b: Vec, a_n: Vec) -> None:
+    """Set nominal state and P0, and let the filter run (theory-amendments.md §8, P0)."""
+    a = s.align
+    Cs = dcm((a.q[0], a.q[1], a.q[2], a.q[3]))
+    has_m = a.n_m > 0.0 and prm.aid_magnetometer > 0.0
+    k = 1.0 / max(a.n_m, 1.0)
+    m_b = tmat_vec(Cs, (k * a.m[0], k * a.m[1], k * a.m[2]))
+    q0, q1, q2, q3, passed = level_and_compass(s, prm, f_b, a_n, m_b, has_m)
+    s.q[0], s.q[1], s.q[2], s.q[3] = q0, q1, q2, q3
+    P = s.P
+    n = s.P.shape[0]
+    for i in range(n):
+        s.dx[i] = 0.0
+        for j in range(n):
+            P[i, j] = 0.0
+    d = dcm((q0, q1, q2, q3))[2]
+    tilt = prm.init_tilt_rest if kind == AT_REST else prm.init_tilt_motion
+    tilt2 = tilt * tilt + (prm.init_accel_bias / s.gravity) ** 2
+    yaw2 = (prm.init_yaw_compass if passed else prm.init_yaw_unknown) ** 2
+    for i in range(3):
+        for j in range(3):
+            P[i, j] = (yaw2 - tilt2) * d[i] * d[j]
+        P[i, i] += tilt2
+    recent_v = s.t - a.t_gnss_v < 2.0
+    recent_p = s.t - a.t_gnss_p < 2.0
+    for i in range(3):
+        s.v[i] = a.gnss_v[i] if recent_v and kind != AT_REST else 0.0
+        sd_v = prm.init_velocity if kind == AT_REST else (max(prm.init_velocity, a.gnss_v_sd[i]) if recent_v else 5.0)
+        P[3 + i, 3 + i] = sd_v * sd_v
+        if recent_p:
+            s.p[i] = a.gnss_p[i]
+        else:
+            s.p[i] = 0.0
+        s.anchor[i] = s.p[i]
+        sd_p = a.gnss_p_sd[i] if recent_p else prm.noise_fake_position
+        P[6 + i, 6 + i] = sd_p * sd_p
+        s.bg[i] = s.rest.mean_w[i] if kind == AT_REST else 0.0
+        sd_bg = prm.init_gyro_bias_rest if kind == AT_REST else prm.init_gyro_bias
+        P[9 + i, 9 + i] = sd_bg * sd_bg
+        s.ba[i] = 0.0
+        P[12 + i, 12 + i] = prm.init_accel_bias * prm.init_accel_bias
+    for i in range(len(s.baro)):
+        s.baro[i] = a.baro - s.origin[2] + s.p[2]
+        P[15 + i, 15 + i] = prm.init_baro_bias * prm.init_baro_bias
+    for k2 in range(len(s.aid)):
+        s.aid[k2].t_passed = s.t
+        s.aid[k2].t_due = s.t
+    s.aid[GNSS_VELOCITY].started = 1 if recent_v else 0
+    s.aid[GNSS_POSITION].started = 1 if recent_p else 0
+    s.aid[BAROMETER].started = 1 if s.t - a.t_baro < 2.0 else 0
+    s.aid[MAGNETOMETER].started = 1 if passed else 0
+    a.kind = kind
+    s.phase = 2
+    s.t_aligned = s.t
+    event(s, s.t, E_ALIGNED if s.n_aligned == 0 else E_REALIGNED, 0, float(kind))
+    s.n_aligned += 1
+
+
+@jit
+def gather(s: Any, prm: Any, rotation: Vec, dv: Vec, dt: float) -> None:
+    """One IMU interval that ends at ``s.t``: gather, and start when the conditions hold.
+
+    Parameters
+    ----------
+    s, prm
+        State and parameter records.
+    rotation, dv
+        Rotation vector [rad] and velocity increment in the middle body frame [m/s] of the interval, as measured.
+    dt
+        Interval [s].
+    """
+    a = s.align
+    half = quat_from_rotvec((0.5 * rotation[0], 0.5 * rotation[1], 0.5 * rotation[2]))
+    q_mid = quat_mul((a.q[0], a.q[1], a.q[2], a.q[3]), half)
+    df = mat_vec(dcm(q_mid), dv)
+    q = quat_unit(quat_mul(q_mid, half))
+    a.q[0], a.q[1], a.q[2], a.q[3] = q
+    for i in range(3):
+        a.f[i] += df[i]
+    fresh = take_due(s, prm)
+
+    gnss_speed = math.sqrt(a.gnss_v[0] ** 2 + a.gnss_v[1] ** 2 + a.gnss_v[2] ** 2)
+    gnss_recent = s.t - a.t_gnss_v < 2.0
+    judged = s.rest.filled >= 4
+    waited = s.t - a.t_first
+    # at rest: the last second is still, GNSS does not contradict, and the compass had time to speak
+    compass_there = prm.aid_magnetometer == 0.0 or a.n_m > 0.0 or waited > WAIT_COMPASS
+    if s.rest.still == 1 and not (gnss_recent and gnss_speed > 1.0 + 3.0 * a.gnss_v_sd[0]) and compass_there:
+        start(s, prm, AT_REST, (s.rest.mean_f[0], s.rest.mean_f[1], s.rest.mean_f[2]), (0.0, 0.0, 0.0))
+        return
+    if not judged:
+        return
+    span = s.t - a.t_span
+    if fresh and span >= SPAN and span <= SPAN_MAX and s.rest.still == 0:
+        k = 1.0 / span
+        f_b = tmat_vec(dcm(q), (k * a.f[0], k * a.f[1], k * a.f[2]))
+        a_n = (k * (a.gnss_v[0] - a.v[0]), k * (a.gnss_v[1] - a.v[1]), k * (a.gnss_v[2] - a.v[2]))
+        if a.open == 2 and norm(f_b) > 0.3 * s.gravity and compass_there:
+            start(s, prm, IN_MOTION, f_b, a_n)
+            return
+        open_span(s, s.t)
+        a.open = 2
+    elif fresh and a.open == 1:  # a span for motion begins at a GNSS velocity
+        open_span(s, s.t)
+        a.open = 2
+    elif not gnss_recent and waited > WAIT_GRAVITY and span > SPAN:
+        k = 1.0 / span
+        f_b = tmat_vec(dcm(q), (k * a.f[0], k * a.f[1], k * a.f[2]))
+        if norm(f_b) > 0.3 * s.gravity:
+            start(s, prm, GRAVITY_ONLY, f_b, (0.0, 0.0, 0.0))
+            return
+        open_span(s, s.t)
+    elif span > SPAN_MAX:
+        open_span(s, s.t)

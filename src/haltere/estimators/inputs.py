@@ -1,0 +1,175 @@
+"""From checked streams and a configuration to the arrays and the parameter record that kernels read. It estimates nothing."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from haltere._jit import jit
+from haltere.aids.record import BAROMETER, GNSS_POSITION, GNSS_VELOCITY, MAGNETOMETER
+from haltere.core.earth import pressure_altitude
+from haltere.core.rotation import dcm, quat_unit
+from haltere.errors import HaltereError, UsageError
+from haltere.flight import config as configuration
+from haltere.flight.config import KEYS, Config
+from haltere.flight.door import Checked, first_fix
+from haltere.flight.field import decimal_year, earth_field
+from haltere.flight.log import FlightLog, Stream
+from haltere.strapdown.layout import PARAMETERS
+
+__all__ = ["Measurements", "configure", "horizon", "imu_arrays", "measurements", "parameters"]
+
+FloatArray = NDArray[np.float64]
+
+#: How far the fusion horizon runs behind the largest delay [s] (theory-amendments.md §8).
+HORIZON_MARGIN = 0.05
+
+
+@dataclass
+class Measurements:
+    """Measurements of all sensors in the order of their stamps: sensor code, stamp, values (m, 3), variances (m, 3)."""
+
+    kind: NDArray[np.int64]
+    t: FloatArray
+    z: FloatArray
+    r: FloatArray
+
+
+def configure(
+    flight: FlightLog, checked: Checked, estimator: str, preset: str = "default", config: Config | Mapping[str, Any] | str | Path | None = None,
+    overrides: Mapping[str, Any] | None = None,
+) -> Config:
+    """Complete configuration of a run: defaults, then the flight's own, then a file or mapping, then single overrides.
+
+    Home and field that nobody named come from the first 3-D fix and the World Magnetic Model there, so that the configuration
+    that comes back reproduces the run, online too.
+    """
+    meta = flight.meta
+    keys: dict[str, Any] = {"imu.kind": meta.imu_kind}
+    where = "flight.toml"
+    for stream, seconds in meta.delays.items():
+        keys[f"delay.{stream}"] = seconds
+    keys |= {f"noise.{k}": v for k, v in meta.noise.items()} | {f"field.{k}": v for k, v in meta.field.items()}
+    if meta.home is not None:
+        keys |= {"home.lat": meta.home.lat, "home.lon": meta.home.lon, "home.alt": meta.home.alt}
+    known = set(KEYS) | set(configuration.GROUPS)
+    keys = {k: v for k, v in keys.items() if k in known or not k.startswith("delay.")}  # a delay of a stream no estimator reads
+    base = configuration.resolve(estimator, preset, keys, where).values
+    given: dict[str, Any] = {}
+    if isinstance(config, Config):
+        given = dict(config.values)
+    elif isinstance(config, Mapping):
+        given = dict(config)
+    elif config is not None:
+        _, _, given = configuration.load(config)
+    given |= dict(overrides or {})
+    resolved = configuration.resolve(estimator, preset, {**base, **_spread(given)}, "configuration")
+    values = dict(resolved.values)
+    if math.isnan(resolved.number("home.lat")):
+        fix = first_fix(checked.streams.get("gnss"))
+        if fix is not None:
+            values |= {"home.lat": fix[0], "home.lon": fix[1], "home.alt": fix[2]}
+    elif math.isnan(float(values["home.lon"])) or math.isnan(float(values["home.alt"])):
+        raise UsageError("home.lat, home.lon and home.alt together", "only some of them", "configuration")
+    if not math.isnan(float(values["home.lat"])):
+        model = earth_field(float(values["home.lat"]), float(values["home.lon"]), float(values["home.alt"]), decimal_year(meta.start_utc))
+        for key, value in (("declination", model.declination), ("dip", model.dip), ("strength", model.strength)):
+            if math.isnan(float(values[f"field.{key}"])):
+                values[f"field.{key}"] = value
+    if math.isnan(float(values["field.declination"])):
+        values["field.declination"] = 0.0
+    return Config(estimator, preset, values)
+
+
+def _spread(keys: Mapping[str, Any]) -> dict[str, Any]:
+    """Keys with those that stand for several written out, so that they override a flight's own."""
+    return {name: value for key, value in keys.items() for name in configuration.GROUPS.get(key, (key,))}
+
+
+def horizon(config: Config) -> float:
+    """How far the fusion horizon runs behind the newest sample [s]."""
+    return max(config.number(k) for k in KEYS if k.startswith("delay.")) + HORIZON_MARGIN
+
+
+def parameters(config: Config) -> NDArray[np.void]:
+    """Parameter record, one element, of a configuration."""
+    record = np.zeros(1, PARAMETERS)
+    for name in PARAMETERS.names or ():
+        if name in ("horizon", "covariance_interval", "imu_mean"):
+            continue
+        record[name] = config.number(name.replace("_", ".", 1))
+    record["imu_mean"] = config.number("imu.kind")
+    record["horizon"] = horizon(config)
+    record["covariance_interval"] = 0.1
+    return record
+
+
+def _mounted(flight: FlightLog, stream: str, vectors: FloatArray) -> FloatArray:
+    """Vectors of a sensor turned into the body frame by the flight's mounting quaternion q_b_sensor."""
+    q = flight.meta.mounting.get(stream)
+    if q is None:
+        return np.ascontiguousarray(vectors)
+    if not math.isfinite(sum(q)) or abs(math.sqrt(sum(x * x for x in q)) - 1.0) > 1e-2:
+        raise HaltereError("a unit quaternion q_b_sensor", f"{q}", f"flight.toml [mounting] {stream}")
+    return np.ascontiguousarray(vectors @ np.array(dcm(quat_unit(tuple(q)))).T)  # type: ignore[arg-type]
+
+
+def imu_arrays(flight: FlightLog, checked: Checked) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Times (n,), angular rates (n, 3) [rad/s] and specific forces (n, 3) [m/s^2] in the body frame."""
+    imu = checked.streams["imu"]
+    return imu.t, _mounted(flight, "imu", imu.vector("gyro")), _mounted(flight, "imu", imu.vector("accel"))
+
+
+@jit
+def _altitudes(pressure: Any, scale: float, out: Any) -> None:
+    for i in range(len(pressure)):
+        out[i] = scale * pressure_altitude(pressure[i])
+
+
+def altitude_of(pressure: FloatArray, config: Config) -> FloatArray:
+    """Pressure altitude [m], scaled by the ground temperature where it is known (theory-amendments.md §8)."""
+    temperature = config.number("baro.temperature")
+    out = np.empty(len(pressure))
+    _altitudes(np.ascontiguousarray(pressure), 1.0 if math.isnan(temperature) else temperature / 288.15, out)
+    return out
+
+
+def _variances(stream: Stream, *names: str) -> FloatArray:
+    """Squares of 1-sigma columns side by side; NaN where not given or not positive."""
+    sd = np.column_stack([stream.get(n) for n in names])
+    return np.where(sd > 0.0, sd * sd, np.nan)
+
+
+def measurements(flight: FlightLog, checked: Checked, config: Config) -> Measurements:
+    """Measurements that the configuration lets in, in the order of their stamps (ties: the order of the sensor codes)."""
+    parts: list[tuple[int, FloatArray, FloatArray, FloatArray]] = []
+    gnss = checked.streams.get("gnss")
+    if gnss is not None and config["aid.gnss"] == "on":
+        v, r_v = gnss.vector("vel", "ned"), _variances(gnss, "s_acc", "s_acc", "s_acc")
+        p, r_p = np.column_stack([gnss.get(c) for c in ("lat", "lon", "alt")]), _variances(gnss, "h_acc", "h_acc", "v_acc")
+        for kind, z, r in ((GNSS_VELOCITY, v, r_v), (GNSS_POSITION, p, r_p)):
+            there = np.isfinite(z[:, :2]).all(axis=1)
+            parts.append((kind, gnss.t[there], z[there], r[there]))
+    baro = checked.streams.get("barometer")
+    if baro is not None and config["aid.barometer"] == "on" and config["baro.offset"] == "on":
+        pressure = baro.get("pressure")
+        h = altitude_of(pressure, config) if np.isfinite(pressure).any() else baro.get("altitude").copy()
+        there = np.isfinite(h)
+        nan = np.full((int(there.sum()), 2), np.nan)
+        parts.append((BAROMETER, baro.t[there], np.column_stack([h[there], nan]), np.full((int(there.sum()), 3), np.nan)))
+    mag = checked.streams.get("magnetometer")
+    if mag is not None and config["aid.magnetometer"] != "off":
+        parts.append((MAGNETOMETER, mag.t, _mounted(flight, "magnetometer", mag.vector("mag")), np.full((len(mag), 3), np.nan)))
+    if not parts:
+        return Measurements(np.empty(0, np.int64), np.empty(0), np.empty((0, 3)), np.empty((0, 3)))
+    kind = np.concatenate([np.full(len(t), k, np.int64) for k, t, _, _ in parts])
+    t = np.concatenate([p[1] for p in parts])
+    order = np.argsort(t, kind="stable")
+    z, r = np.concatenate([p[2] for p in parts]), np.concatenate([p[3] for p in parts])
+    return Measurements(kind[order], t[order], np.ascontiguousarray(z[order]), np.ascontiguousarray(r[order]))

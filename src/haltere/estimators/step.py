@@ -1,0 +1,349 @@
+"""The compiled step of every error-state filter here: queue, alignment, prediction, fusion, output rows. One code, online and offline."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+from haltere._jit import jit
+from haltere.aids import rest
+from haltere.aids.dispatch import fuse_all
+from haltere.aids.record import (
+    BAROMETER,
+    E_DIVERGED,
+    E_GAP,
+    GNSS_POSITION,
+    GNSS_VELOCITY,
+    MAGNETOMETER,
+    event,
+)
+from haltere.core.rotation import Vec, cross, dcm, mat_vec, quat_from_rotvec, quat_mul
+from haltere.estimators import alignment
+from haltere.filter.queue import pop_imu, push, push_imu
+from haltere.strapdown.propagate import predict
+
+__all__ = ["COVARIANCE_ROWS", "advance", "flush", "now", "offer", "row_count", "run_chunk", "step"]
+
+#: Rows of the covariance output: time, the upper triangles of the five core blocks, the variance of the barometer offset.
+COVARIANCE_ROWS = 1 + 5 * 6 + 1
+#: Longest interval [s] bridged in one step, and longest gap [s] bridged at all.
+LONG_STEP, SUB_STEP = 0.1, 0.05
+
+
+@jit
+def row_count(n_baro: int) -> int:
+    """Rows of the output array: t, q 4, v 3, p 3, bg 3, ba 3, baro; P_θθ upper triangle 6, other variances 12, baro."""
+    return 35 + 2 * n_baro
+
+
+@jit
+def write_row(s: Any, rows: Any) -> None:
+    """Append the state and the variances that a solution reports."""
+    i = s.n_rows
+    if i >= rows.shape[1]:
+        return
+    P = s.P
+    rows[0, i] = s.t
+    for j in range(4):
+        rows[1 + j, i] = s.q[j]
+    for j in range(3):
+        rows[5 + j, i] = s.v[j]
+        rows[8 + j, i] = s.p[j]
+        rows[11 + j, i] = s.bg[j]
+        rows[14 + j, i] = s.ba[j]
+        rows[23 + j, i] = P[3 + j, 3 + j]
+        rows[26 + j, i] = P[6 + j, 6 + j]
+        rows[29 + j, i] = P[9 + j, 9 + j]
+        rows[32 + j, i] = P[12 + j, 12 + j]
+    rows[17, i] = P[0, 0]
+    rows[18, i] = P[0, 1]
+    rows[19, i] = P[0, 2]
+    rows[20, i] = P[1, 1]
+    rows[21, i] = P[1, 2]
+    rows[22, i] = P[2, 2]
+    for j in range(len(s.baro)):
+        rows[35 + j, i] = s.baro[j]
+        rows[35 + len(s.baro) + j, i] = P[15 + j, 15 + j]
+    s.n_rows = i + 1
+
+
+@jit
+def write_covariance(s: Any, prm: Any, cov: Any) -> None:
+    """Append the core blocks of P at most every ``covariance_interval``, for the consistency statistics."""
+    i = s.n_cov
+    if s.t < s.t_covariance or i >= cov.shape[1]:
+        return
+    s.t_covariance = s.t + prm.covariance_interval
+    cov[0, i] = s.t
+    k = 1
+    for b in range(5):
+        for r in range(3):
+            for c in range(r, 3):
+                cov[k, i] = s.P[3 * b + r, 3 * b + c]
+                k += 1
+    cov[k, i] = math.nan
+    for j in range(len(s.baro)):
+        cov[k, i] = s.P[15 + j, 15 + j]
+    s.n_cov = i + 1
+
+
+@jit
+def sound(s: Any) -> bool:
+    """Are state and covariance finite and every variance positive?"""
+    total = s.q[0] + s.q[1] + s.q[2] + s.q[3]
+    for i in range(3):
+        total += s.v[i] + s.p[i] + s.bg[i] + s.ba[i]
+    if not math.isfinite(total):
+        return False
+    for i in range(s.P.shape[0]):
+        if not (s.P[i, i] > 0.0 and s.P[i, i] < 1e14):
+            return False
+    return True
+
+
+@jit
+def predict_interval(s: Any, prm: Any, w0: Vec, f0: Vec, w1: Vec, f1: Vec, dt: float) -> None:
+    """Predict over one interval between IMU samples (w0, f0) and (w1, f1), raw.
+
+    Samples are values at their times (then coning and sculling of a linear course are kept), or means since the one before.
+    """
+    bg, ba = (s.bg[0], s.bg[1], s.bg[2]), (s.ba[0], s.ba[1], s.ba[2])
+    b = (w1[0] - bg[0], w1[1] - bg[1], w1[2] - bg[2])
+    g = (f1[0] - ba[0], f1[1] - ba[1], f1[2] - ba[2])
+    if prm.imu_mean > 0.0:
+        predict(s, prm, b, g, (b[0] * dt, b[1] * dt, b[2] * dt), (g[0] * dt, g[1] * dt, g[2] * dt), dt)
+        return
+    a = (w0[0] - bg[0], w0[1] - bg[1], w0[2] - bg[2])
+    h = (f0[0] - ba[0], f0[1] - ba[1], f0[2] - ba[2])
+    w = (0.5 * (a[0] + b[0]), 0.5 * (a[1] + b[1]), 0.5 * (a[2] + b[2]))
+    f = (0.5 * (h[0] + g[0]), 0.5 * (h[1] + g[1]), 0.5 * (h[2] + g[2]))
+    k = dt * dt / 12.0
+    coning = cross(a, b)
+    s1, s2 = cross(a, g), cross(h, b)
+    predict(
+        s, prm, w, f,
+        (w[0] * dt + k * coning[0], w[1] * dt + k * coning[1], w[2] * dt + k * coning[2]),
+        (f[0] * dt + k * (s1[0] + s2[0]), f[1] * dt + k * (s1[1] + s2[1]), f[2] * dt + k * (s1[2] + s2[2])),
+        dt,
+    )
+
+
+@jit
+def bridge_gap(s: Any, prm: Any, w0: Vec, f0: Vec, w1: Vec, f1: Vec, dt: float) -> None:
+    """Predict across missing samples in sub-steps, and admit that nobody knows what happened meanwhile."""
+    n = int(math.ceil(dt / SUB_STEP))
+    h = dt / n
+    for i in range(n):
+        k0, k1 = i / n, (i + 1) / n
+        predict_interval(
+            s, prm,
+            (w0[0] + k0 * (w1[0] - w0[0]), w0[1] + k0 * (w1[1] - w0[1]), w0[2] + k0 * (w1[2] - w0[2])),
+            (f0[0] + k0 * (f1[0] - f0[0]), f0[1] + k0 * (f1[1] - f0[1]), f0[2] + k0 * (f1[2] - f0[2])),
+            (w0[0] + k1 * (w1[0] - w0[0]), w0[1] + k1 * (w1[1] - w0[1]), w0[2] + k1 * (w1[2] - w0[2])),
+            (f0[0] + k1 * (f1[0] - f0[0]), f0[1] + k1 * (f1[1] - f0[1]), f0[2] + k1 * (f1[2] - f0[2])),
+            h,
+        )
+    turn, push_v, push_p = 0.5 * dt, 3.0 * dt, 1.5 * dt * dt
+    for i in range(3):
+        s.P[i, i] += turn * turn
+        s.P[3 + i, 3 + i] += push_v * push_v
+        s.P[6 + i, 6 + i] += push_p * push_p
+    event(s, s.t, E_GAP, 0, dt)
+    s.n_gaps += 1
+
+
+@jit
+def advance(s: Any, prm: Any, rows: Any, cov: Any, aids: Any) -> None:
+    """Move the fusion horizon over the oldest queued IMU sample."""
+    m = s.imu[s.imu_head]
+    t = m.t
+    w1, f1 = (m.w[0], m.w[1], m.w[2]), (m.f[0], m.f[1], m.f[2])
+    pop_imu(s)
+    w0, f0 = (s.w_raw[0], s.w_raw[1], s.w_raw[2]), (s.f_raw[0], s.f_raw[1], s.f_raw[2])
+    s.w_raw[0], s.w_raw[1], s.w_raw[2] = w1
+    s.f_raw[0], s.f_raw[1], s.f_raw[2] = f1
+    s.n_steps += 1
+    if s.phase == 0:
+        alignment.begin(s, t)
+        s.n_unaligned += 1
+        return
+    dt = t - s.t
+    if s.n_steps == 1:  # begun from a given state: its first sample only begins the first interval
+        s.t = t
+        write_row(s, rows)
+        write_covariance(s, prm, cov)
+        return
+    if dt > prm.timeout_imu:  # too long to bridge: align anew
+        event(s, t, E_GAP, 0, dt)
+        s.n_gaps += 1
+        alignment.begin(s, t)
+        s.n_unaligned += 1
+        return
+    s.t = t
+    rest.monitor(s, prm, t, w1, f1)
+    if s.phase == 1:
+        if prm.imu_mean > 0.0:
+            alignment.gather(s, prm, (w1[0] * dt, w1[1] * dt, w1[2] * dt), (f1[0] * dt, f1[1] * dt, f1[2] * dt), dt)
+        else:
+            k = 0.5 * dt
+            alignment.gather(
+                s, prm,
+                (k * (w0[0] + w1[0]), k * (w0[1] + w1[1]), k * (w0[2] + w1[2])),
+                (k * (f0[0] + f1[0]), k * (f0[1] + f1[1]), k * (f0[2] + f1[2])),
+                dt,
+            )
+        if s.phase == 1:
+            s.n_unaligned += 1
+            return
+        s.t_covariance = t
+    else:
+        if dt > LONG_STEP:
+            bridge_gap(s, prm, w0, f0, w1, f1, dt)
+        else:
+            predict_interval(s, prm, w0, f0, w1, f1, dt)
+        fuse_all(s, prm, aids, dt, w1, f1)
+    if t >= s.t_covariance and not sound(s):
+        event(s, t, E_DIVERGED, 0, 0.0)
+        alignment.begin(s, t)
+        s.n_unaligned += 1
+        return
+    write_row(s, rows)
+    write_covariance(s, prm, cov)
+
+
+@jit
+def step(S: Any, PRM: Any, t: float, gyro: Vec, accel: Vec, rows: Any, cov: Any, aids: Any) -> int:
+    """Take one IMU sample, and move the horizon as far as ``horizon`` behind it.
+
+    Parameters
+    ----------
+    S, PRM
+        One-element arrays of the state and parameter records.
+    t
+        Time stamp [s].
+    gyro, accel
+        Angular rate [rad/s] and specific force [m/s^2], body frame.
+    rows, cov, aids
+        Output arrays; their fill is counted in the state. Arrays without room are left alone.
+
+    Returns
+    -------
+    int
+        0 taken; 1 not finite; 2 not after the sample before. The last two are counted and left out.
+    """
+    s, prm = S[0], PRM[0]
+    if not (math.isfinite(t) and math.isfinite(gyro[0] + gyro[1] + gyro[2] + accel[0] + accel[1] + accel[2])):
+        s.n_bad += 1
+        return 1
+    if s.n_steps + s.imu_n > 0 and t <= s.t_newest:
+        s.n_bad += 1
+        return 2
+    if s.imu_n == len(s.imu):  # no room: the horizon comes closer than configured
+        s.n_ring_full += 1
+        advance(s, prm, rows, cov, aids)
+    push_imu(s, t, gyro, accel)
+    s.t_newest = t
+    while s.imu_n > 0 and s.imu[s.imu_head].t <= t - prm.horizon:
+        advance(s, prm, rows, cov, aids)
+    return 0
+
+
+@jit
+def flush(S: Any, PRM: Any, rows: Any, cov: Any, aids: Any) -> None:
+    """Move the horizon to the newest IMU sample: the end of a log."""
+    s, prm = S[0], PRM[0]
+    while s.imu_n > 0:
+        advance(s, prm, rows, cov, aids)
+
+
+@jit
+def offer(S: Any, PRM: Any, kind: int, t: float, z: Vec, r: Vec) -> int:
+    """Queue a measurement stamped t by the time it was valid; see `filter.queue.push` for what comes back, 2 when switched off."""
+    s, prm = S[0], PRM[0]
+    delay, on = 0.0, 1.0
+    if kind == GNSS_VELOCITY:
+        delay, on = prm.delay_gnss_velocity, prm.aid_gnss
+    elif kind == GNSS_POSITION:
+        delay, on = prm.delay_gnss_position, prm.aid_gnss
+    elif kind == BAROMETER:
+        delay, on = prm.delay_barometer, prm.aid_barometer
+    elif kind == MAGNETOMETER:
+        delay, on = prm.delay_magnetometer, prm.aid_magnetometer
+    if on == 0.0:
+        return 2
+    return push(s, kind, t - delay, z, r)
+
+
+@jit
+def run_chunk(
+    S: Any, PRM: Any, t: Any, gyro: Any, accel: Any, i: int, i_end: int, kinds: Any, stamps: Any, z: Any, r: Any, j: int,
+    rows: Any, cov: Any, aids: Any,
+) -> tuple[int, int]:
+    """Drive `offer` and `step` over IMU samples i ... i_end - 1 and the measurements stamped at or before them.
+
+    Stops early when the record arrays are nearly full, so that nothing is lost. The same calls in the same order online give
+    the same numbers.
+
+    Parameters
+    ----------
+    t, gyro, accel
+        IMU columns, shapes (n,), (n, 3), (n, 3).
+    kinds, stamps, z, r
+        Measurements in order of their stamps: sensor codes (m,), stamps (m,), values and variances (m, 3).
+    j
+        Next measurement.
+
+    Returns
+    -------
+    tuple of int
+        Next IMU sample and next measurement.
+    """
+    s = S[0]
+    while i < i_end:
+        if s.n_aids > len(aids) - 2048 or s.n_events > len(s.event) - 8:
+            break
+        while j < len(stamps) and stamps[j] <= t[i]:
+            offer(S, PRM, kinds[j], stamps[j], (z[j, 0], z[j, 1], z[j, 2]), (r[j, 0], r[j, 1], r[j, 2]))
+            j += 1
+        step(S, PRM, t[i], (gyro[i, 0], gyro[i, 1], gyro[i, 2]), (accel[i, 0], accel[i, 1], accel[i, 2]), rows, cov, aids)
+        i += 1
+    return i, j
+
+
+@jit
+def now(S: Any, PRM: Any, out: Any) -> None:
+    """State predicted to the newest IMU sample by repeating the queued increments: t, q, v, p into ``out`` (11)."""
+    s, prm = S[0], PRM[0]
+    q = (s.q[0], s.q[1], s.q[2], s.q[3])
+    v, p = (s.v[0], s.v[1], s.v[2]), (s.p[0], s.p[1], s.p[2])
+    t = s.t
+    w0, f0 = (s.w_raw[0], s.w_raw[1], s.w_raw[2]), (s.f_raw[0], s.f_raw[1], s.f_raw[2])
+    for i in range(s.imu_n):
+        m = s.imu[(s.imu_head + i) % len(s.imu)]
+        w1, f1 = (m.w[0], m.w[1], m.w[2]), (m.f[0], m.f[1], m.f[2])
+        dt = m.t - t
+        k = 1.0 if prm.imu_mean > 0.0 else 0.5
+        w = (
+            (k * w1[0] + (1.0 - k) * w0[0] - s.bg[0]) * dt,
+            (k * w1[1] + (1.0 - k) * w0[1] - s.bg[1]) * dt,
+            (k * w1[2] + (1.0 - k) * w0[2] - s.bg[2]) * dt,
+        )
+        f = (
+            (k * f1[0] + (1.0 - k) * f0[0] - s.ba[0]) * dt,
+            (k * f1[1] + (1.0 - k) * f0[1] - s.ba[1]) * dt,
+            (k * f1[2] + (1.0 - k) * f0[2] - s.ba[2]) * dt,
+        )
+        half = quat_from_rotvec((0.5 * w[0], 0.5 * w[1], 0.5 * w[2]))
+        q = quat_mul(q, half)
+        a = mat_vec(dcm(q), f)
+        q = quat_mul(q, half)
+        a = (a[0], a[1], a[2] + s.gravity * dt)
+        p = (p[0] + dt * (v[0] + 0.5 * a[0]), p[1] + dt * (v[1] + 0.5 * a[1]), p[2] + dt * (v[2] + 0.5 * a[2]))
+        v = (v[0] + a[0], v[1] + a[1], v[2] + a[2])
+        w0, f0, t = w1, f1, m.t
+    out[0] = t
+    for i in range(4):
+        out[1 + i] = q[i]
+    for i in range(3):
+        out[5 + i] = v[i]
+        out[8 + i] = p[i]

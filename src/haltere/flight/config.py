@@ -1,0 +1,257 @@
+"""Configuration: every key with its default, unit and meaning, once; presets, overrides and the file that reproduces a run."""
+
+from __future__ import annotations
+
+import difflib
+import math
+import tomllib
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from haltere.errors import HaltereError, UsageError
+
+__all__ = ["ESTIMATORS", "KEYS", "PRESETS", "Config", "Key", "defaults", "load", "parse_assignment", "resolve"]
+
+DEG = math.pi / 180.0
+Value = float | str | bool
+
+#: Estimators and the presets each has.
+PRESETS: dict[str, tuple[str, ...]] = {"navigator": ("default",), "ahrs": ("default",)}
+ESTIMATORS = tuple(PRESETS)
+
+
+@dataclass(frozen=True)
+class Key:
+    """One configuration key.
+
+    Attributes
+    ----------
+    default
+        Value where nothing else is said.
+    unit
+        SI unit, or the words it may be.
+    doc
+        What it is, and what raising or lowering it does.
+    words
+        Allowed words of a switch, in the order of their codes 0, 1, 2.
+    low, high
+        Bounds of a number, both allowed.
+    """
+
+    default: Value
+    unit: str
+    doc: str
+    words: tuple[str, ...] = ()
+    low: float = -math.inf
+    high: float = math.inf
+
+
+def _positive(default: float, unit: str, doc: str) -> Key:
+    return Key(default, unit, doc, low=1e-12)
+
+
+def _switch(default: str, doc: str, words: tuple[str, ...] = ("off", "on")) -> Key:
+    return Key(default, " or ".join(words), doc, words=words)
+
+
+def _delay(doc: str) -> Key:
+    return Key(0.0, "s", doc, low=0.0, high=2.0)
+
+
+#: Every key (theory-amendments.md §8 unless said). NaN: from the data.
+KEYS: dict[str, Key] = {
+    "noise.gyro": _positive(1.5e-3, "rad/s/sqrt(Hz)", "Gyro white noise density, vibration included. Higher trusts the aids more."),
+    "noise.accel": _positive(0.035, "m/s^2/sqrt(Hz)", "Accelerometer white noise density, vibration included."),
+    "noise.gyro_bias": _positive(1e-4, "rad/s/sqrt(s)", "Walk of the gyro bias."),
+    "noise.accel_bias": _positive(3e-4, "m/s^2/sqrt(s)", "Walk of the accelerometer bias."),
+    "noise.baro_bias": _positive(0.05, "m/sqrt(s)", "Walk of the barometer offset (weather, wind on the port)."),
+    "noise.gnss_velocity": _positive(0.5, "m/s", "GNSS velocity, 1 sigma, where the receiver gives no accuracy."),
+    "noise.gnss_position": _positive(1.0, "m", "GNSS horizontal position, 1 sigma, where the receiver gives no accuracy."),
+    "noise.gnss_altitude": _positive(2.0, "m", "GNSS altitude, 1 sigma, where the receiver gives no accuracy."),
+    "noise.gnss_velocity_min": _positive(0.1, "m/s", "Least velocity accuracy believed of a receiver: its errors last for many fixes."),
+    "noise.gnss_position_min": _positive(0.5, "m", "Least position accuracy believed of a receiver."),
+    "noise.barometer": _positive(1.0, "m", "Barometric altitude, 1 sigma."),
+    "noise.magnetometer": _positive(5.0, "uT", "Magnetometer, 1 sigma a sample, disturbances included (theory.md §8: 0.05 G)."),
+    "noise.zero_velocity": _positive(0.05, "m/s", "Zero velocity at rest, 1 sigma at 10 Hz."),
+    "noise.zero_rate": _positive(0.01, "rad/s", "Zero rate at rest, 1 sigma at 10 Hz."),
+    "noise.fake_position": _positive(10.0, "m", "Fake position in flight, 1 sigma at 5 Hz."),
+    "noise.fake_position_rest": _positive(0.5, "m", "Fake position at rest, 1 sigma at 5 Hz."),
+    "noise.fake_velocity": _positive(2.0, "m/s", "Fake velocity of ahrs, 1 sigma at 5 Hz. Lower trusts gravity more, and accelerations less."),
+    "gate.gnss": _positive(5.0, "sigma", "Innovation gate of GNSS position and velocity, joint over the components."),
+    "gate.barometer": _positive(5.0, "sigma", "Innovation gate of the barometer."),
+    "gate.magnetometer": _positive(3.0, "sigma", "Innovation gate of the magnetometer."),
+    "gate.zero_velocity": _positive(5.0, "sigma", "Innovation gate of zero velocity."),
+    "gate.zero_rate": _positive(5.0, "sigma", "Innovation gate of zero rate."),
+    "delay.gnss_velocity": _delay("A velocity stamped t was valid at t - delay. delay.gnss sets velocity and position."),
+    "delay.gnss_position": _delay("The same for position."),
+    "delay.barometer": _delay("The same for the barometer."),
+    "delay.magnetometer": _delay("The same for the magnetometer."),
+    "aid.gnss": _switch("on", "Use GNSS position and velocity."),
+    "aid.barometer": _switch("on", "Use the barometer."),
+    "aid.magnetometer": _switch("heading", "Use the magnetometer: as a heading that leaves tilt alone, or as three axes.", ("off", "heading", "3-axis")),
+    "aid.zero_velocity": _switch("on", "Zero velocity at rest."),
+    "aid.zero_rate": _switch("on", "Zero rate at rest."),
+    "aid.fake_position": _switch("on", "Fake position while nothing else holds it."),
+    "aid.fake_velocity": _switch("off", "Fake zero velocity, always on in ahrs."),
+    "timeout.gnss": _positive(7.0, "s", "After this long without a fix that passes, GNSS is let in again by force, at the gate's edge."),
+    "timeout.barometer": _positive(7.0, "s", "The same for the barometer."),
+    "timeout.magnetometer": _positive(10.0, "s", "The same for the magnetometer."),
+    "timeout.imu": _positive(2.0, "s", "IMU gaps longer than this are not bridged: the filter aligns anew."),
+    "arm.gnss_x": Key(0.0, "m", "GNSS antenna ahead of the IMU (FRD)."),
+    "arm.gnss_y": Key(0.0, "m", "GNSS antenna right of the IMU."),
+    "arm.gnss_z": Key(0.0, "m", "GNSS antenna below the IMU."),
+    "field.declination": Key(math.nan, "rad", "Declination, east positive. Default: World Magnetic Model at home, else 0."),
+    "field.dip": Key(math.nan, "rad", "Dip, down positive. Default: World Magnetic Model at home, else from the first samples."),
+    "field.strength": Key(math.nan, "uT", "Field strength. Default: World Magnetic Model at home, else from the first samples."),
+    "field.tolerance_strength": _positive(0.35, "1", "Refuse a sample whose strength is off by more than this fraction."),
+    "field.tolerance_dip": _positive(20.0 * DEG, "rad", "Refuse a sample whose dip is off by more than this."),
+    "home.lat": Key(math.nan, "deg", "Origin latitude. Default: the log's home, else the first 3-D fix."),
+    "home.lon": Key(math.nan, "deg", "Origin longitude."),
+    "home.alt": Key(math.nan, "m", "Origin altitude above mean sea level."),
+    "init.tilt_rest": _positive(3.0 * DEG, "rad", "1 sigma of roll and pitch aligned at rest, without the accelerometer bias."),
+    "init.tilt_motion": _positive(10.0 * DEG, "rad", "1 sigma of roll and pitch aligned in motion."),
+    "init.yaw_compass": _positive(10.0 * DEG, "rad", "1 sigma of yaw from a compass that passed its tests."),
+    "init.yaw_unknown": _positive(60.0 * DEG, "rad", "1 sigma of yaw without one."),
+    "init.gyro_bias_rest": _positive(0.05 * DEG, "rad/s", "1 sigma of the gyro bias measured at rest."),
+    "init.gyro_bias": _positive(0.01, "rad/s", "1 sigma of the gyro bias aligned in motion."),
+    "init.accel_bias": _positive(0.2, "m/s^2", "1 sigma of the accelerometer bias."),
+    "init.velocity": _positive(0.3, "m/s", "Least 1 sigma of velocity."),
+    "init.baro_bias": _positive(3.0, "m", "1 sigma of the barometer offset."),
+    "rest.gyro": _positive(0.02, "rad/s", "At rest the rate's standard deviation over a second is below this."),
+    "rest.accel": _positive(0.3, "m/s^2", "At rest the standard deviation of |f| over a second is below this."),
+    "rest.gravity": _positive(0.5, "m/s^2", "At rest mean |f| differs from gravity by less than this."),
+    "imu.kind": _switch("instant", "An IMU sample is the value at its time, or the mean since the sample before.", ("instant", "mean")),
+    "baro.temperature": Key(math.nan, "K", "Air temperature at the ground, scales pressure altitude. Default: standard atmosphere.", low=200.0, high=330.0),
+    "baro.offset": _switch("on", "Estimate the barometer offset as a state."),
+}
+
+#: Keys that stand for several, each with what it sets.
+GROUPS: dict[str, tuple[str, ...]] = {"delay.gnss": ("delay.gnss_velocity", "delay.gnss_position")}
+
+#: What an estimator sets differently from the defaults above.
+_OVERRIDES: dict[str, dict[str, Value]] = {
+    "navigator": {},
+    "ahrs": {"aid.gnss": "off", "aid.barometer": "off", "aid.fake_velocity": "on", "baro.offset": "off"},
+}
+#: Keys that an estimator does not have: changing them would change nothing.
+_FIXED: dict[str, tuple[str, ...]] = {"navigator": (), "ahrs": tuple(_OVERRIDES["ahrs"])}
+
+
+@dataclass(frozen=True)
+class Config:
+    """A complete configuration: estimator, preset and a value for every key."""
+
+    estimator: str
+    preset: str
+    values: Mapping[str, Value]
+
+    def __getitem__(self, key: str) -> Value:
+        return self.values[key]
+
+    def number(self, key: str) -> float:
+        """Value as a number; the code of a switch."""
+        value = self.values[key]
+        words = KEYS[key].words
+        return float(words.index(str(value))) if words else float(value)
+
+    def to_toml(self) -> str:
+        """The file that reproduces the run."""
+        import tomli_w
+
+        tables: dict[str, Any] = {"estimator": self.estimator, "preset": self.preset}
+        for key, value in self.values.items():
+            head, _, tail = key.partition(".")
+            tables.setdefault(head, {})[tail] = value
+        return tomli_w.dumps(tables)
+
+    def changed(self, **keys: Value) -> Config:
+        """Same configuration with some keys changed; dots are written as two underscores."""
+        return resolve(self.estimator, self.preset, {**self.values, **{k.replace("__", "."): v for k, v in keys.items()}})
+
+
+def defaults(estimator: str = "navigator", preset: str = "default") -> dict[str, Value]:
+    """Every key with its value before anything is overridden."""
+    if estimator not in PRESETS:
+        near = difflib.get_close_matches(estimator, ESTIMATORS, 1)
+        hint = f"did you mean {near[0]!r}?" if near else f"one of {', '.join(ESTIMATORS)}"
+        raise UsageError("an estimator", repr(estimator), "--estimator", hint)
+    if preset not in PRESETS[estimator]:
+        raise UsageError(
+            f"a preset of {estimator} ({', '.join(PRESETS[estimator])})", repr(preset), "--preset",
+            f"{estimator} is not one of the published designs, so it has no printed or corrected form",
+        )  # fmt: skip
+    return {key: spec.default for key, spec in KEYS.items()} | _OVERRIDES[estimator]
+
+
+def _check(key: str, value: Any, where: str) -> Value:
+    """Value of a key in its proper type, or an error that says what is wrong."""
+    spec = KEYS.get(key)
+    if spec is None:
+        near = difflib.get_close_matches(key, [*KEYS, *GROUPS], 1)
+        raise UsageError("a configuration key", repr(key), where, f"did you mean {near[0]!r}?" if near else "see the documentation's table of keys")
+    if spec.words:
+        word = {True: "on", False: "off"}.get(value, str(value)) if isinstance(value, bool) else str(value)
+        if word not in spec.words:
+            raise UsageError(f"{key} to be {spec.unit}", repr(value), where)
+        return word
+    try:
+        number = float(value)
+    except (TypeError, ValueError):
+        raise UsageError(f"a number [{spec.unit}] for {key}", repr(value), where) from None
+    if math.isnan(number) and isinstance(spec.default, float) and math.isnan(spec.default):
+        return number
+    if not (spec.low <= number <= spec.high) or math.isinf(number):
+        bounds = f"between {spec.low:g} and {spec.high:g}" if spec.high < math.inf else f"of at least {spec.low:g}"
+        raise UsageError(f"a number [{spec.unit}] {bounds if spec.low > -math.inf else 'that is finite'} for {key}", repr(value), where)
+    return number
+
+
+def resolve(estimator: str = "navigator", preset: str = "default", overrides: Mapping[str, Any] | None = None, where: str = "") -> Config:
+    """Complete configuration of an estimator from its preset and overrides.
+
+    Raises
+    ------
+    UsageError
+        Unknown estimator, preset or key (with the nearest name), a value out of bounds, or a key the estimator lacks.
+    """
+    values = defaults(estimator, preset)
+    for key, value in (overrides or {}).items():
+        for name in GROUPS.get(key, (key,)):
+            checked = _check(name, value, where)
+            if name in _FIXED[estimator] and checked != values[name]:
+                raise UsageError(f"a key that {estimator} has", repr(name), where, f"{estimator} keeps it at {values[name]}")
+            values[name] = checked
+    return Config(estimator, preset, values)
+
+
+def parse_assignment(text: str) -> tuple[str, str]:
+    """Key and value of ``key=value`` as given to ``--set``."""
+    key, sign, value = text.partition("=")
+    if not sign or not key.strip() or not value.strip():
+        raise UsageError("key=value", repr(text), "--set", "for example --set gate.gnss=4")
+    return key.strip(), value.strip()
+
+
+def load(path: str | Path) -> tuple[str | None, str | None, dict[str, Value]]:
+    """Estimator, preset (None where not said) and keys of a configuration file."""
+    path = Path(path)
+    try:
+        document = tomllib.loads(path.read_text(encoding="utf-8"))
+    except FileNotFoundError:
+        raise UsageError("a configuration file", "no such file", str(path)) from None
+    except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
+        raise HaltereError("a TOML file of configuration keys", str(error), str(path)) from None
+    keys: dict[str, Value] = {}
+    for head, body in document.items():
+        if head in ("estimator", "preset"):
+            continue
+        if not isinstance(body, dict):
+            _check(head, body, str(path))
+            continue
+        for tail, value in body.items():
+            key = f"{head}.{tail}"
+            for name in GROUPS.get(key, (key,)):
+                keys[name] = _check(name, value, str(path))
+    return document.get("estimator"), document.get("preset"), keys

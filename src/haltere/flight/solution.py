@@ -1,0 +1,116 @@
+"""Solution: what an estimator gives back, and its files. It computes no statistics (see metrics) and draws nothing (see report)."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import tempfile
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from haltere.errors import HaltereError
+from haltere.flight.config import Config
+
+if TYPE_CHECKING:
+    import polars as pl
+
+__all__ = ["Solution"]
+
+FloatArray = NDArray[np.float64]
+
+
+@dataclass
+class Solution:
+    """An estimator's output over a flight.
+
+    Attributes
+    ----------
+    table
+        Columns of ``solution.parquet`` (interface.md §3; units and frames in `haltere.flight.schema.SOLUTION`), each (n,).
+    aids
+        Columns of ``aids.parquet``: one row a measurement component offered; numbers and text.
+    events
+        Faults and state changes, as in ``events.json``.
+    config
+        Every parameter as used.
+    summary
+        As in ``summary.json``.
+    covariance
+        ``t`` (m,) and the 3x3 blocks ``attitude, velocity, position, gyro_bias, accel_bias`` (m, 3, 3) and ``baro_bias`` (m, 1, 1)
+        at times spaced by at least 0.1 s, for consistency statistics. The attitude block is of the body-frame rotation error.
+    """
+
+    table: dict[str, FloatArray]
+    aids: dict[str, NDArray[Any]]
+    events: list[dict[str, Any]]
+    config: Config
+    summary: dict[str, Any] = field(default_factory=dict)
+    covariance: dict[str, FloatArray] = field(default_factory=dict)
+
+    @property
+    def t(self) -> FloatArray:
+        """Time [s] of every row."""
+        return self.table["t"]
+
+    def __getitem__(self, name: str) -> FloatArray:
+        return self.table[name]
+
+    def __contains__(self, name: object) -> bool:
+        return name in self.table
+
+    def __len__(self) -> int:
+        return len(self.table["t"])
+
+    def vector(self, stem: str, axes: str = "xyz") -> FloatArray:
+        """Columns ``stem_x, stem_y, ...`` side by side, (n, len(axes))."""
+        return np.column_stack([self.table[f"{stem}_{a}"] for a in axes])
+
+    def to_polars(self) -> pl.DataFrame:
+        """The solution as a polars table."""
+        import polars as pl
+
+        return pl.DataFrame(dict(self.table))
+
+    def save(self, folder: str | Path, extra: Mapping[str, str] | None = None) -> Path:
+        """Write the files of interface.md §3; none is left half under its final name.
+
+        Parameters
+        ----------
+        folder
+            Where to; made if it is not there. Files of an earlier run are replaced.
+        extra
+            Further text files by name (``report.html``).
+
+        Raises
+        ------
+        HaltereError
+            The folder cannot be written.
+        """
+        import polars as pl
+
+        folder = Path(folder)
+        try:
+            folder.mkdir(parents=True, exist_ok=True)
+            with tempfile.TemporaryDirectory(dir=folder, prefix=".writing-") as name:
+                work = Path(name)
+                self.to_polars().write_parquet(work / "solution.parquet")
+                pl.DataFrame(dict(self.aids)).write_parquet(work / "aids.parquet")
+                (work / "events.json").write_text(json.dumps(self.events, indent=1) + "\n", encoding="utf-8")
+                (work / "summary.json").write_text(json.dumps(self.summary, indent=1, allow_nan=False) + "\n", encoding="utf-8")
+                (work / "config.toml").write_text(self.config.to_toml(), encoding="utf-8")
+                for file, text in (extra or {}).items():
+                    (work / file).write_text(text, encoding="utf-8")
+                for path in sorted(work.iterdir()):
+                    os.replace(path, folder / path.name)
+        except OSError as error:
+            raise HaltereError("a folder that can be written", str(error), str(folder), "give another with --out") from None
+        finally:
+            for left in folder.glob(".writing-*") if folder.is_dir() else ():
+                shutil.rmtree(left, ignore_errors=True)
+        return folder

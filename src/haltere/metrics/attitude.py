@@ -1,0 +1,61 @@
+"""Quaternion arithmetic on whole columns for errors of attitude. Kernels have their own scalar form (core.rotation)."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+__all__ = ["conjugate", "euler", "multiply", "rotation_vector", "slerp"]
+
+FloatArray = NDArray[np.float64]
+
+
+def multiply(a: FloatArray, b: FloatArray) -> FloatArray:
+    """Hamilton product of quaternions, (n, 4) or (4,)."""
+    a0, a1, a2, a3 = np.moveaxis(np.asarray(a), -1, 0)
+    b0, b1, b2, b3 = np.moveaxis(np.asarray(b), -1, 0)
+    return np.stack(
+        [
+            a0 * b0 - a1 * b1 - a2 * b2 - a3 * b3,
+            a0 * b1 + a1 * b0 + a2 * b3 - a3 * b2,
+            a0 * b2 - a1 * b3 + a2 * b0 + a3 * b1,
+            a0 * b3 + a1 * b2 - a2 * b1 + a3 * b0,
+        ],
+        axis=-1,
+    )
+
+
+def conjugate(q: FloatArray) -> FloatArray:
+    """Inverse of unit quaternions."""
+    return np.asarray(q) * np.array([1.0, -1.0, -1.0, -1.0])
+
+
+def rotation_vector(q: FloatArray) -> FloatArray:
+    """Rotation vectors [rad] (n, 3) of unit quaternions (n, 4), the shorter way round."""
+    q = np.where(q[..., :1] < 0.0, -q, q)
+    s = np.linalg.norm(q[..., 1:], axis=-1, keepdims=True)
+    angle = 2.0 * np.arctan2(s, q[..., :1])
+    return q[..., 1:] * np.where(s > 1e-12, angle / np.maximum(s, 1e-300), 2.0)
+
+
+def euler(q: FloatArray) -> FloatArray:
+    """Roll, pitch, yaw [rad] (n, 3) of q_nb (n, 4)."""
+    w, x, y, z = np.moveaxis(np.asarray(q), -1, 0)
+    return np.stack(
+        [
+            np.arctan2(2.0 * (y * z + w * x), w * w - x * x - y * y + z * z),
+            np.arcsin(np.clip(2.0 * (w * y - x * z), -1.0, 1.0)),
+            np.arctan2(2.0 * (x * y + w * z), w * w + x * x - y * y - z * z),
+        ],
+        axis=-1,
+    )
+
+
+def slerp(t: FloatArray, tq: FloatArray, q: FloatArray) -> FloatArray:
+    """Unit quaternions (m, 4) at times t, linear in the rotation vector between rows of q (n, 4) at times tq."""
+    i = np.clip(np.searchsorted(tq, t, side="right") - 1, 0, len(tq) - 2)
+    k = np.clip((t - tq[i]) / (tq[i + 1] - tq[i]), 0.0, 1.0)
+    half = 0.5 * k[:, None] * rotation_vector(multiply(conjugate(q[i]), q[i + 1]))
+    angle = np.linalg.norm(half, axis=1, keepdims=True)
+    step = np.concatenate([np.cos(angle), half * np.sinc(angle / np.pi)], axis=1)
+    return multiply(q[i], step)

@@ -1,0 +1,92 @@
+"""The summary of a run: streams, errors, consistency, health, timings, as in ``summary.json``. It runs nothing."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+
+from haltere._version import __version__
+from haltere.flight.log import FlightLog
+from haltere.flight.solution import Solution
+from haltere.metrics.consistency import nees_series, nees_table, nis_table
+from haltere.metrics.errors import error_series, error_table
+
+__all__ = ["finite", "gaps_of", "summarise"]
+
+
+def gaps_of(t: np.ndarray[Any, np.dtype[np.float64]]) -> int:
+    """Number of intervals longer than four times the median, and than a tenth of a second."""
+    if len(t) < 3:
+        return 0
+    dt = np.diff(t[np.isfinite(t)])
+    if len(dt) == 0:
+        return 0
+    middle = float(np.median(dt))
+    return int(np.count_nonzero(dt > max(4.0 * middle, 0.1)))
+
+
+def finite(value: Any) -> Any:
+    """The same with numbers that are not finite as None, for JSON."""
+    if isinstance(value, dict):
+        return {k: finite(v) for k, v in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [finite(v) for v in value]
+    if isinstance(value, float) and not math.isfinite(value):
+        return None
+    return value
+
+
+def summarise(solution: Solution, flight: FlightLog, facts: dict[str, Any]) -> None:
+    """Fill ``solution.summary`` from the solution, the flight it is of, and what the run knows.
+
+    Only here, after the run, are ``onboard`` and ``truth`` read.
+    """
+    meta = flight.meta
+    summary = solution.summary
+    summary["haltere"] = __version__
+    summary["estimator"] = solution.config.estimator
+    summary["preset"] = solution.config.preset
+    summary["name"] = meta.name
+    summary["source"] = meta.source
+    summary["time_offset"] = meta.time_offset
+    summary["start_utc"] = meta.start_utc
+    summary["origin"] = facts["origin"]
+    summary["aligned_at"] = float(solution.t[0])
+    summary["duration"] = facts["duration"]
+    summary["rows"] = len(solution)
+    summary["streams"] = {
+        name: {
+            "n": len(stream), "rate": stream.rate, "gaps": gaps_of(stream.t), "discarded": facts["discarded"].get(name, {}),
+        }
+        for name, stream in flight.streams.items()
+    }  # fmt: skip
+    summary["errors"] = {
+        name: error_table(error_series(solution, flight[name])) for name in ("truth", "onboard") if name in flight and len(flight[name])
+    }
+    summary["nis"] = nis_table(solution)
+    summary["nees"] = nees_table(nees_series(solution, flight["truth"])) if "truth" in flight else {}
+    summary["health"] = _health(solution, flight)
+    summary["warnings"] = facts["warnings"]
+    summary["timings"] = facts["timings"]
+    solution.summary = finite(summary)
+
+
+def _health(solution: Solution, flight: FlightLog) -> dict[str, dict[str, str]]:
+    """What the innovations say of each sensor that was fused; diagnosis proper is another room's work."""
+    out: dict[str, dict[str, str]] = {}
+    for sensor in ("gnss", "magnetometer", "barometer"):
+        if sensor not in flight or sensor not in solution.summary["nis"]:
+            continue
+        nis = solution.summary["nis"][sensor]
+        bad = (nis["rejected"] + nis["deweighted"]) / nis["n"]
+        forced = any(e["kind"] == "timeout" and e["sensor"] == sensor for e in solution.events)
+        if forced or bad > 0.2:
+            verdict = "bad"
+        elif bad > 0.02:
+            verdict = "doubtful"
+        else:
+            verdict = "good"
+        out[sensor] = {"verdict": verdict, "why": f"{100.0 * bad:.1f} % of {nis['n']} components refused or de-weighted"}
+    return out

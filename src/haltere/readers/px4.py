@@ -1,0 +1,413 @@
+"""Reading PX4 ULog files into a FlightLog through all versions of their topics. It corrects units and names, never samples."""
+
+from __future__ import annotations
+
+import contextlib
+import io
+import struct
+from collections.abc import Iterator
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, BinaryIO
+
+import numpy as np
+from numpy.typing import NDArray
+
+from haltere.errors import HaltereError
+from haltere.readers._common import GAUSS, RPM, UTC_FLOOR_US, Builder, Columns, FloatArray, IntArray, number, unusable
+from haltere.readers._px4_solution import add_solution, add_truth, set_home
+
+if TYPE_CHECKING:
+    from haltere.flight.log import FlightLog
+
+__all__ = ["MAGIC", "Log", "Topic", "read", "sniff"]
+
+MAGIC = b"ULog\x01\x12\x35"
+#: ``*_timestamp_relative`` of a sensor that has no sample.
+INVALID_RELATIVE = 2147483647
+#: Bytes out of place in the definitions after which they are beyond repair.
+STRAY_LIMIT = 10_000
+#: Motors by MAV_TYPE (quadrotor, hexarotor, octorotor, tricopter), where outputs are not named otherwise.
+MOTORS_BY_TYPE = {2: 4, 13: 6, 14: 8, 15: 3}
+#: ``actuator_function`` of the first motor.
+MOTOR_1 = 101
+#: Topics that are read, all versions.
+TOPICS = (
+    "sensor_combined vehicle_imu sensor_selection vehicle_magnetometer sensor_mag vehicle_air_data sensor_baro "
+    "vehicle_gps_position sensor_gps airspeed_validated airspeed esc_status actuator_motors actuator_outputs battery_status "
+    "vehicle_attitude vehicle_local_position "
+    "vehicle_global_position estimator_sensor_bias estimator_selector_status wind wind_estimate home_position "
+    "vehicle_attitude_groundtruth vehicle_local_position_groundtruth vehicle_global_position_groundtruth"
+).split()
+
+
+def sniff(path: Path, head: bytes) -> bool:
+    """Whether a file is a ULog."""
+    return head.startswith(MAGIC)
+
+
+class Topic:
+    """One instance of one uORB topic as columns.
+
+    Parameters
+    ----------
+    name, instance
+        Topic and instance number.
+    data
+        Column by ULog field name.
+    """
+
+    def __init__(self, name: str, instance: int, data: dict[str, NDArray[Any]]) -> None:
+        self.name, self.instance, self.data = name, instance, data
+        sent = data["timestamp"].astype(np.int64)
+        sample = data["timestamp_sample"].astype(np.int64) if "timestamp_sample" in data else None
+        # The sample stamp is the truer one, but some senders leave it zero or never change it.
+        usable = sample is not None and (sample > 0).any() and (len(sample) == 1 or bool((sample != sample[0]).any()))
+        self.us: IntArray = np.where(sample > 0, sample, sent) if usable and sample is not None else sent
+        self.sent: IntArray = sent
+
+    def __contains__(self, field: object) -> bool:
+        return field in self.data
+
+    def __len__(self) -> int:
+        return len(self.us)
+
+    def get(self, *fields: str, scale: float = 1.0) -> FloatArray:
+        """First of several fields that is there, scaled; NaN where none is."""
+        for field in fields:
+            if field in self.data:
+                return number(self.data[field]) * scale
+        return np.full(len(self.us), np.nan)
+
+    def vector(self, field: str, out: str, scale: float = 1.0) -> Columns:
+        """Three components ``field[0..2]`` as ``out_x, out_y, out_z``."""
+        return {f"{out}_{a}": self.get(f"{field}[{i}]", scale=scale) for i, a in enumerate("xyz")}
+
+    def last(self, field: str) -> int | None:
+        """Newest value of an integer field."""
+        return int(self.data[field][-1]) if field in self.data and len(self) else None
+
+
+class Log:
+    """The topics of a ULog that have usable times."""
+
+    def __init__(self, path: Path, builder: Builder) -> None:
+        from pyulog import ULog
+
+        said = io.StringIO()
+        # pyulog tells of damage on standard output, where only results belong.
+        with contextlib.redirect_stdout(said):
+            try:
+                with path.open("rb") as file:  # pyulog leaves a file open that it cannot parse
+                    _check_definitions(file, path)
+                    ulog = ULog(file, list(TOPICS))
+            except HaltereError:
+                raise
+            except Exception as error:
+                raise unusable(path, "a ULog that can be parsed", f"{type(error).__name__}: {error}") from error
+        if ulog.file_corruption:
+            builder.note("the file is damaged: what could not be parsed is missing")
+        if ulog.dropouts:
+            total = sum(d.duration for d in ulog.dropouts)
+            builder.note(f"the logger dropped data {len(ulog.dropouts)} times, {total} ms in all")
+        self.params: dict[str, float] = dict(ulog.initial_parameters)
+        self.params.update({name: value for _, name, value in ulog.changed_parameters})
+        self.version: str | None = ulog.get_version_info_str()
+        self._topics: dict[str, dict[int, Topic]] = {}
+        for data in ulog.data_list:
+            stamps = data.data.get("timestamp")
+            if stamps is None or not len(stamps):
+                continue
+            if len(stamps) > 1 and (stamps == stamps[0]).all():
+                builder.note(f"{data.name}[{data.multi_id}] left out: all {len(stamps)} samples are stamped {int(stamps[0])} us")
+                builder.discard(data.name, "constant time stamps", len(stamps))
+                continue
+            self._topics.setdefault(data.name, {})[data.multi_id] = Topic(data.name, data.multi_id, data.data)
+
+    def one(self, *names: str, instance: int = 0) -> Topic | None:
+        """First of several topics that is there, in an instance or else the lowest one."""
+        for name in names:
+            found = self._topics.get(name)
+            if found:
+                return found.get(instance) or found[min(found)]
+        return None
+
+    def all(self, name: str) -> list[Topic]:
+        """Every instance of a topic, in order."""
+        return [topic for _, topic in sorted(self._topics.get(name, {}).items())]
+
+
+def _check_definitions(file: BinaryIO, path: Path) -> None:
+    """Walk the definitions up to the first data, as pyulog does, and refuse damage on which it would never come to an end."""
+    size = path.stat().st_size
+    at, stray = 16, 0
+    while at + 3 <= size:
+        file.seek(at)
+        length, kind = struct.unpack("<Hc", file.read(3))
+        if kind in (b"A", b"L", b"C"):
+            break
+        if kind not in (b"I", b"M", b"F", b"P", b"Q", b"B") and (kind == b"\0" or not 0 < length <= 10000):
+            stray += 1
+            if at + 3 + length > size or stray > STRAY_LIMIT:
+                raise unusable(path, "a ULog with whole definitions", f"damage at byte {at}")
+            at += 1
+        else:
+            at += 3 + length
+    file.seek(0)
+
+
+def read(path: Path) -> FlightLog:
+    """Read a ULog.
+
+    Parameters
+    ----------
+    path
+        The ``.ulg`` file.
+
+    Returns
+    -------
+    FlightLog
+        ``imu`` is ``sensor_combined`` (means over the interval since the sample before), the other physical units ``imu.1``, ...
+
+    Raises
+    ------
+    HaltereError
+        The file cannot be parsed or holds no topic that is read.
+
+    Notes
+    -----
+    Topics and units after the ULog specification and PX4's uORB message definitions.
+    """
+    builder = Builder(path, "PX4 ULog")
+    log = Log(path, builder)
+    if log.version:
+        builder.meta.source += f", PX4 {log.version}"
+    _add_imu(log, builder)
+    _add_magnetometer(log, builder)
+    _add_barometer(log, builder)
+    _add_gnss(log, builder)
+    _add_airdata(log, builder)
+    _add_rotors(log, builder)
+    for i, topic in enumerate(log.all("battery_status")):
+        current = topic.get("current_a")
+        current[current < 0.0] = np.nan  # -1: not measured
+        builder.add("power" if i == 0 else f"power.{i}", topic.us, {"voltage": topic.get("voltage_v"), "current": current})
+    set_home(log, builder)
+    add_solution(log, builder)
+    add_truth(log, builder)
+    if builder.utc is None:
+        span = builder.span("imu")
+        if span and span[0] > UTC_FLOOR_US:
+            builder.utc = (span[0], span[0])
+    return builder.build()
+
+
+def _numbered(stream: str, items: list[Topic], start: int = 0) -> Iterator[tuple[str, Topic]]:
+    for i, item in enumerate(items, start):
+        yield (stream if i == 0 else f"{stream}.{i}"), item
+
+
+def _add_imu(log: Log, builder: Builder) -> None:
+    units = log.all("vehicle_imu")
+    combined = log.one("sensor_combined")
+    primary = _primary_imu(log, units)
+    if combined is not None:
+        accel = combined.vector("accelerometer_m_s2", "accel")
+        if "accelerometer_timestamp_relative" in combined:
+            lost = combined.data["accelerometer_timestamp_relative"] == INVALID_RELATIVE
+            for values in accel.values():
+                values[lost] = np.nan
+            builder.discard("imu", "accelerometer without a sample (rows kept, accel NaN)", int(lost.sum()))
+        builder.add("imu", combined.us, {**combined.vector("gyro_rad", "gyro"), **accel})
+        builder.meta.imu_kind = "mean"
+        if primary in units:
+            units.remove(primary)
+    elif primary is not None:
+        units.insert(0, units.pop(units.index(primary)))
+        builder.note("no sensor_combined: imu is vehicle_imu")
+        builder.meta.imu_kind = "mean"
+    for name, unit in _numbered("imu", units, start=1 if combined is not None else 0):
+        columns: Columns = {}
+        for field, out in (("delta_angle", "gyro"), ("delta_velocity", "accel")):
+            span = unit.get(f"{field}_dt", scale=1e-6)
+            span[span <= 0.0] = np.nan
+            columns |= {k: v / span for k, v in unit.vector(field, out).items()}
+        builder.add(name, unit.us, columns)
+    if combined is None and not units:
+        builder.note("no sensor_combined or vehicle_imu topic: there is no imu stream")
+
+
+def _primary_imu(log: Log, units: list[Topic]) -> Topic | None:
+    """The unit that the autopilot navigated with, by device, else the first."""
+    selection = log.one("sensor_selection")
+    wanted = selection.last("gyro_device_id") if selection else None
+    for unit in units:
+        if wanted and unit.last("gyro_device_id") == wanted:
+            return unit
+    return units[0] if units else None
+
+
+def _held(topic: Topic, prefix: str, stream: str, builder: Builder) -> tuple[IntArray, NDArray[np.intp]]:
+    """Stamps and rows of a slow sensor inside an old sensor_combined: invalid rows and held copies left out."""
+    relative = topic.data[f"{prefix}_timestamp_relative"].astype(np.int64)
+    valid = relative != INVALID_RELATIVE
+    stamps = topic.us + np.where(valid, relative, 0)
+    rows = np.flatnonzero(valid)
+    fresh = np.ones(len(rows), dtype=bool)
+    fresh[1:] = stamps[rows][1:] != stamps[rows][:-1]
+    if not valid.all():
+        builder.note(f"{stream}: {int((~valid).sum())} rows of sensor_combined hold no sample yet")
+    if not fresh.all():
+        builder.note(f"{stream}: {int((~fresh).sum())} rows of sensor_combined repeat the sample before and were read once")
+    rows = rows[fresh]
+    return stamps[rows], rows
+
+
+def _add_magnetometer(log: Log, builder: Builder) -> None:
+    units = log.all("vehicle_magnetometer")
+    # Until 1.11 the selection names the device, since then the estimator that uses it does.
+    naming = [t for t in (log.one("sensor_selection"), log.one("estimator_sensor_bias")) if t is not None and "mag_device_id" in t]
+    wanted = naming[0].last("mag_device_id") if naming else None
+    units.sort(key=lambda u: (not wanted or u.last("device_id") != wanted, u.instance))
+    for name, unit in _numbered("magnetometer", units):
+        builder.add(name, unit.us, unit.vector("magnetometer_ga", "mag", scale=GAUSS))
+    combined = log.one("sensor_combined")
+    if not units and combined is not None and "magnetometer_timestamp_relative" in combined:
+        us, rows = _held(combined, "magnetometer", "magnetometer", builder)
+        builder.add("magnetometer", us, {k: v[rows] for k, v in combined.vector("magnetometer_ga", "mag", scale=GAUSS).items()})
+    if not builder.has("magnetometer"):
+        for name, unit in _numbered("magnetometer", log.all("sensor_mag")):
+            builder.note("magnetometer is sensor_mag: raw, without the calibration that the autopilot applied")
+            builder.add(name, unit.us, {f"mag_{a}": unit.get(a, scale=GAUSS) for a in "xyz"})
+
+
+def _add_barometer(log: Log, builder: Builder) -> None:
+    air = log.one("vehicle_air_data")
+    combined = log.one("sensor_combined")
+    if air is not None:
+        columns = {
+            "pressure": air.get("baro_pressure_pa"),
+            "temperature": air.get("baro_temp_celcius", "ambient_temperature"),
+            "altitude": air.get("baro_alt_meter"),
+        }
+        builder.add("barometer", air.us, columns)
+    elif combined is not None and "baro_timestamp_relative" in combined:
+        us, rows = _held(combined, "baro", "barometer", builder)
+        columns = {"temperature": combined.get("baro_temp_celcius")[rows], "altitude": combined.get("baro_alt_meter")[rows]}
+        builder.add("barometer", us, columns)
+    device = air.last("baro_device_id") if air is not None else None
+    units = [u for u in log.all("sensor_baro") if device is None or u.last("device_id") != device]
+    for name, unit in _numbered("barometer", units, start=1 if builder.has("barometer") else 0):
+        pressure = unit.get("pressure")
+        if float(np.median(np.nan_to_num(pressure))) < 2000.0:  # millibar before 1.13
+            pressure *= 100.0
+        builder.add(name, unit.us, {"pressure": pressure, "temperature": unit.get("temperature"), "altitude": unit.get("altitude")})
+
+
+def _add_gnss(log: Log, builder: Builder) -> None:
+    units = log.all("vehicle_gps_position") or log.all("sensor_gps")
+    for name, gps in _numbered("gnss", units):
+        new = "latitude_deg" in gps
+        velocity = {f"vel_{a}": gps.get(f"vel_{a}_m_s") for a in "ned"}
+        if "vel_ned_valid" in gps:
+            lost = gps.data["vel_ned_valid"] == 0
+            for values in velocity.values():
+                values[lost] = np.nan
+            builder.discard(name, "velocity that the receiver calls invalid (rows kept, vel NaN)", int(lost.sum()))
+        columns = {
+            "lat": gps.get("latitude_deg") if new else gps.get("lat", scale=1e-7),
+            "lon": gps.get("longitude_deg") if new else gps.get("lon", scale=1e-7),
+            "alt": gps.get("altitude_msl_m") if new else gps.get("alt", scale=1e-3),
+            **velocity,
+            "h_acc": gps.get("eph"),
+            "v_acc": gps.get("epv"),
+            "s_acc": gps.get("s_variance_m_s"),  # an accuracy, despite its name
+            "fix_type": gps.get("fix_type"),
+            "num_sats": gps.get("satellites_used"),
+        }
+        builder.add(name, gps.us, columns)
+        if builder.utc is None and "time_utc_usec" in gps:
+            utc = gps.data["time_utc_usec"].astype(np.int64)
+            known = np.flatnonzero((utc > UTC_FLOOR_US) & (columns["fix_type"] >= 3.0))
+            if len(known):
+                builder.utc = (int(gps.us[known[0]]), int(utc[known[0]]))
+
+
+def _add_airdata(log: Log, builder: Builder) -> None:
+    topic = log.one("airspeed_validated", "airspeed")
+    if topic is None:
+        return
+    speed = topic.get("true_airspeed_m_s")
+    source = topic.get("airspeed_source", "selected_airspeed_index")
+    # -1 none, 0 made of GNSS and wind, 4 a model: only 1 to 3 are sensors.
+    made_up = np.isfinite(source) & ((source < 1.0) | (source > 3.0))
+    keep = np.isfinite(speed) & ~made_up
+    builder.discard("airdata", "airspeed not of a sensor", int(made_up.sum()))
+    builder.discard("airdata", "airspeed that the autopilot calls invalid", int((~np.isfinite(speed) & ~made_up).sum()))
+    builder.add("airdata", topic.us[keep], {"airspeed": speed[keep]})
+
+
+def _add_rotors(log: Log, builder: Builder) -> None:
+    speeds = _rotor_speeds(log, builder)
+    if speeds is not None:
+        builder.add("rotors", *speeds)
+    commands = _rotor_commands(log, builder)
+    if commands is not None:
+        builder.add("actuators" if speeds is not None else "rotors", *commands)
+    if speeds is not None and commands is not None:
+        builder.note("rotor commands are in the stream actuators: they have their own time base")
+
+
+def _rotor_speeds(log: Log, builder: Builder) -> tuple[IntArray, Columns] | None:
+    esc = log.one("esc_status")
+    if esc is None:
+        return None
+    count = int(np.max(esc.get("esc_count"), initial=0)) if "esc_count" in esc else 12
+    online = esc.data.get("esc_online_flags")
+    functions = [esc.last(f"esc[{i}].actuator_function") or 0 for i in range(12)]
+    columns: Columns = {}
+    for i in range(12):
+        rpm = esc.get(f"esc[{i}].esc_rpm")
+        seen = esc.get(f"esc[{i}].timestamp")
+        if i >= count or np.isnan(rpm).all() or not ((rpm != 0.0) | (seen > 0.0)).any():
+            continue
+        if online is not None and online.any():
+            rpm[(online >> i) & 1 == 0] = np.nan
+        if any(functions):
+            motor = functions[i] - MOTOR_1
+            if not 0 <= motor < 12:
+                builder.note(f"esc[{i}] left out: its function {functions[i]} is no motor")
+                continue
+        else:
+            motor = i
+        columns[f"speed_{motor}"] = np.abs(rpm) * RPM
+    if not any(functions) and columns:
+        builder.note("rotor speeds are in the order of the speed controllers: the log does not name their motors")
+    return (esc.us, dict(sorted(columns.items(), key=lambda item: int(item[0][6:])))) if columns else None
+
+
+def _rotor_commands(log: Log, builder: Builder) -> tuple[IntArray, Columns] | None:
+    motors = log.one("actuator_motors")
+    if motors is not None:
+        columns = {f"command_{i}": motors.get(f"control[{i}]") for i in range(12)}
+        return motors.us, {k: v for k, v in columns.items() if np.isfinite(v).any()}
+    for outputs in log.all("actuator_outputs"):
+        channels = _motor_channels(log, outputs)
+        if not channels:
+            continue
+        values = np.column_stack([outputs.get(f"output[{c}]") for c in channels])
+        if (values > 1.0).any():  # pulse width [us], 1000 to 2000
+            values = np.clip((values - 1000.0) / 1000.0, 0.0, 1.0)
+        builder.note("rotor commands are actuator_outputs: (pulse width - 1000 us) / 1000 us, channels by parameter or airframe type")
+        return outputs.us, {f"command_{i}": values[:, i] for i in range(len(channels))}
+    if log.all("actuator_outputs"):
+        builder.note("actuator_outputs left out: the log does not tell which channels are motors")
+    return None
+
+
+def _motor_channels(log: Log, outputs: Topic) -> list[int]:
+    """Output channels of motors 1, 2, ... by PWM_MAIN_FUNCx, else the first ones of a multirotor's first output group."""
+    functions = {int(log.params.get(f"PWM_MAIN_FUNC{c + 1}", 0)): c for c in range(16)}
+    named = [functions[f] for f in range(MOTOR_1, MOTOR_1 + 12) if f in functions]
+    if named or outputs.instance:
+        return named if not outputs.instance else []
+    return list(range(MOTORS_BY_TYPE.get(int(log.params.get("MAV_TYPE", 0)), 0)))

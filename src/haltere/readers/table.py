@@ -1,0 +1,254 @@
+"""Reading one CSV or Parquet table by a column map, or by column names as in the schema. It guesses neither units nor axes."""
+
+from __future__ import annotations
+
+import difflib
+import re
+from collections.abc import Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from haltere.errors import HaltereError
+from haltere.flight.folder import to_column
+from haltere.flight.log import FlightLog, FlightMeta, Stream
+from haltere.flight.schema import NAVIGATION_STREAMS, STREAMS, base_name, column
+from haltere.readers._common import FloatArray, unusable
+
+if TYPE_CHECKING:
+    import polars as pl
+
+__all__ = ["UNITS", "read", "sniff"]
+
+#: Factor and offset to the schema's unit, by that unit and the unit of the source: value = factor * source + offset.
+UNITS: dict[str, dict[str, tuple[float, float]]] = {
+    "s": {"s": (1.0, 0.0), "ms": (1e-3, 0.0), "us": (1e-6, 0.0), "ns": (1e-9, 0.0)},
+    "rad/s": {"rad/s": (1.0, 0.0), "deg/s": (np.pi / 180.0, 0.0), "mrad/s": (1e-3, 0.0), "rpm": (2.0 * np.pi / 60.0, 0.0)},
+    "m/s^2": {"m/s^2": (1.0, 0.0), "g": (9.80665, 0.0), "mg": (9.80665e-3, 0.0)},
+    "uT": {"uT": (1.0, 0.0), "mT": (1e3, 0.0), "T": (1e6, 0.0), "nT": (1e-3, 0.0), "G": (100.0, 0.0), "mG": (0.1, 0.0)},
+    "Pa": {"Pa": (1.0, 0.0), "hPa": (100.0, 0.0), "mbar": (100.0, 0.0), "kPa": (1e3, 0.0)},
+    "deg": {"deg": (1.0, 0.0), "rad": (180.0 / np.pi, 0.0), "1e-7deg": (1e-7, 0.0)},
+    "rad": {"rad": (1.0, 0.0), "deg": (np.pi / 180.0, 0.0), "mrad": (1e-3, 0.0)},
+    "m": {"m": (1.0, 0.0), "mm": (1e-3, 0.0), "cm": (1e-2, 0.0), "km": (1e3, 0.0), "ft": (0.3048, 0.0)},
+    "m/s": {"m/s": (1.0, 0.0), "cm/s": (1e-2, 0.0), "mm/s": (1e-3, 0.0), "km/h": (1.0 / 3.6, 0.0), "kt": (1852.0 / 3600.0, 0.0)},
+    "V": {"V": (1.0, 0.0), "mV": (1e-3, 0.0)},
+    "A": {"A": (1.0, 0.0), "mA": (1e-3, 0.0)},
+    "degC": {"degC": (1.0, 0.0), "K": (1.0, -273.15)},
+    "1": {"1": (1.0, 0.0), "%": (1e-2, 0.0)},
+}
+ALIASES = {
+    **{"µs": "us", "μs": "us", "µT": "uT", "μT": "uT", "°": "deg", "°/s": "deg/s", "dps": "deg/s", "°C": "degC", "C": "degC"},
+    **{"m/s2": "m/s^2", "m/s²": "m/s^2", "m/s/s": "m/s^2", "gauss": "G", "mgauss": "mG", "milligauss": "mG"},
+    **{"degE7": "1e-7deg", "knots": "kt", "-": "1"},
+}
+WITH_UNIT = re.compile(r"^(?P<name>.*?)\s*\[(?P<unit>[^\[\]]*)\]\s*$", re.DOTALL)
+WORD = re.compile(r"^\s*\"?[A-Za-z_][^\x00-\x1f]*\"?\s*$")
+PARQUET = b"PAR1"
+#: Streams whose columns are recognised without the stream's name.
+BARE_STREAMS = tuple(name for name in STREAMS if name not in ("onboard", "truth"))
+EXAMPLE = 'e.g. {"imu.t": "time_us [us]", "imu.gyro_x": "gx [deg/s]", "imu.accel_x": "ax [g]"}'
+
+
+def sniff(path: Path, head: bytes) -> bool:
+    """Whether a file is a Parquet table, or text with a header line of names and rows of as many fields."""
+    if head.startswith(PARQUET):
+        return True
+    if b"\0" in head:
+        return False
+    try:
+        text = head.decode("utf-8")
+    except UnicodeDecodeError as error:
+        if error.start < len(head) - 4:  # not just a letter cut by the end of the head
+            return False
+        text = head[: error.start].decode("utf-8")
+    lines = [line for line in text.lstrip("\ufeff").splitlines() if line.strip() and not line.startswith("#")][:2]
+    if not lines:
+        return False
+    mark = _delimiter(lines[0])
+    fields = lines[0].split(mark)
+    return len(fields) > 1 and all(WORD.match(f) for f in fields) and (len(lines) < 2 or len(lines[1].split(mark)) == len(fields))
+
+
+def read(path: Path, column_map: Mapping[str, str] | None = None) -> FlightLog:
+    """Read a table.
+
+    Parameters
+    ----------
+    path
+        A ``.csv`` (comma, semicolon or tab; a header line) or ``.parquet`` file.
+    column_map
+        Which column is what: ``{"imu.gyro_x": "gx [deg/s]"}`` takes the column ``gx`` in deg/s for ``gyro_x`` of the stream ``imu``.
+        Without a unit the schema's is meant; ``-gx`` turns the sign; ``{"t": "time [ms]"}`` is the time of every stream without its own.
+        Without a map, columns named ``imu.gyro_x`` or ``gyro_x``, with or without a unit in brackets, are taken.
+
+    Returns
+    -------
+    FlightLog
+        Streams in SI units, t = 0 at the earliest sample. Rows in which a stream has no value are not part of that stream.
+        Axes are taken as NED/FRD.
+
+    Raises
+    ------
+    HaltereError
+        An unreadable table, a source column that is not there, an unknown stream, column or unit, or a stream without time.
+    """
+    table = _load(path)
+    notes: list[str] = []
+    wanted = _from_map(column_map, table, path) if column_map is not None else _from_names(table, path, notes)
+    discarded: dict[str, dict[str, int]] = {}
+    streams: dict[str, dict[str, FloatArray]] = {}
+    for stream, columns in wanted.items():
+        values = {name: _values(table, source, unit, column_unit(stream, name), path) for name, (source, unit) in columns.items()}
+        t = values.pop("t")
+        some = np.any([np.isfinite(v) for v in values.values()], axis=0) if values else np.zeros(len(t), dtype=bool)
+        timed = np.isfinite(t)
+        if lost := int((some & ~timed).sum()):
+            discarded[stream] = {"no time stamp": lost}
+        keep = some & timed
+        if not keep.any():
+            notes.append(f"{stream} left out: no row has a time and a value")
+            continue
+        streams[stream] = {"t": t[keep], **{k: v[keep] for k, v in values.items()}}
+    if not streams:
+        raise unusable(path, "a table with values", "none in the columns that were taken", f"give a column map, {EXAMPLE}")
+    starts = [float(s["t"].min()) for name, s in streams.items() if base_name(name) in NAVIGATION_STREAMS]
+    start = min(starts or [float(s["t"].min()) for s in streams.values()])
+    for name, part in streams.items():
+        part["t"] = part["t"] - start
+        if base_name(name) in ("magnetometer", "gnss", "barometer") and _held(part):
+            notes.append(f"{name}: most rows repeat the row before, as if held between updates; each counts as a sample")
+    meta = FlightMeta(name=path.stem, source=f"table: {path.name}", time_offset=start)
+    return FlightLog({name: Stream(part) for name, part in streams.items()}, meta, notes, discarded)
+
+
+def column_unit(stream: str, name: str) -> str:
+    """Unit of a column of the schema."""
+    known = column(stream, name)
+    return known.unit if known is not None else "1"
+
+
+def _held(part: dict[str, FloatArray]) -> bool:
+    rows = np.column_stack([v for k, v in part.items() if k != "t"])
+    return len(rows) > 10 and float(np.mean(np.all((rows[1:] == rows[:-1]) | np.isnan(rows[1:]), axis=1))) > 0.5
+
+
+def _delimiter(line: str) -> str:
+    return max(",;\t", key=line.count)
+
+
+def _load(path: Path) -> pl.DataFrame:
+    import polars as pl
+
+    try:
+        with path.open("rb") as file:
+            head = file.read(65536)
+        if head.startswith(PARQUET):
+            return pl.read_parquet(path)
+        if b"\0" in head:
+            raise unusable(path, "a CSV or Parquet table", "binary content of another kind")
+        lines = [line for line in head.decode("utf-8", "replace").splitlines() if line.strip() and not line.startswith("#")]
+        mark = _delimiter(lines[0]) if lines else ","
+        table = pl.read_csv(path, separator=mark, infer_schema_length=0, comment_prefix="#")
+        return table.rename({name: name.strip() for name in table.columns})
+    except (pl.exceptions.PolarsError, OSError) as error:
+        raise unusable(path, "a CSV or Parquet table", str(error).splitlines()[0]) from error
+
+
+def _split_unit(text: str) -> tuple[str, str]:
+    found = WITH_UNIT.match(text)
+    return (found["name"].strip(), found["unit"].strip()) if found else (text.strip(), "")
+
+
+def _nearest(word: str, known: list[str]) -> str:
+    close = difflib.get_close_matches(word, known, n=1, cutoff=0.4)
+    return f"did you mean {close[0]!r}?" if close else f"there are: {', '.join(known[:40])}"
+
+
+#: Source column and unit by column of a stream.
+Wanted = dict[str, dict[str, tuple[str, str]]]
+
+
+def _from_map(column_map: Mapping[str, str], table: pl.DataFrame, path: Path) -> Wanted:
+    wanted: Wanted = {}
+    shared: tuple[str, str] | None = None
+    for target, text in column_map.items():
+        source, unit = _split_unit(text)
+        if source not in table.columns and source.lstrip("-") not in table.columns:
+            if text not in table.columns:  # the header itself may hold the unit
+                raise HaltereError(f"the column {source!r} for {target}", "no such column", str(path), _nearest(source, table.columns))
+            source = text
+        if target == "t":
+            shared = source, unit
+            continue
+        stream, _, name = target.rpartition(".")
+        if base_name(stream) not in STREAMS:
+            known = list(STREAMS)
+            raise HaltereError("stream.column of a known stream", repr(target), "column map", _nearest(base_name(stream) or target, known))
+        if column(stream, name) is None:
+            known = list(STREAMS[base_name(stream)].names)
+            raise HaltereError(f"a column of {stream}", repr(name), "column map", _nearest(name, known))
+        wanted.setdefault(stream, {})[name] = source, unit
+    return _timed(wanted, shared, path)
+
+
+def _from_names(table: pl.DataFrame, path: Path, notes: list[str]) -> Wanted:
+    wanted: Wanted = {}
+    shared: tuple[str, str] | None = None
+    unknown = []
+    for source in table.columns:
+        name, unit = _split_unit(source)
+        if name == "t" or (unit and name.lower() in ("time", "timestamp")):
+            shared = source, unit
+            continue
+        stream, _, last = name.rpartition(".")
+        if not stream:
+            stream = next((s for s in BARE_STREAMS if column(s, name) is not None), "")
+        if not stream or column(stream, last) is None:
+            unknown.append(source)
+            continue
+        wanted.setdefault(stream, {})[last] = source, unit
+    if not wanted:
+        raise HaltereError(
+            "columns named as in haltere's schema (gyro_x or imu.gyro_x), or a column map",
+            f"columns {', '.join(table.columns[:12])}{' ...' if len(table.columns) > 12 else ''}",
+            str(path),
+            f"give a column map, {EXAMPLE}",
+        )
+    if unknown:
+        notes.append(f"columns not recognised and not read: {', '.join(unknown)}")
+    return _timed(wanted, shared, path)
+
+
+def _timed(wanted: Wanted, shared: tuple[str, str] | None, path: Path) -> Wanted:
+    for stream, columns in wanted.items():
+        if "t" not in columns:
+            if shared is None:
+                remedy = f'map "{stream}.t", or "t" for every stream, to the time column'
+                raise HaltereError(f"a time for {stream}", "none", str(path), remedy)
+            columns["t"] = shared
+    return wanted
+
+
+def _values(table: pl.DataFrame, source: str, unit: str, target_unit: str, path: Path) -> FloatArray:
+    """One column in the schema's unit."""
+    name = source if source in table.columns else source.lstrip("-")
+    allowed = UNITS[target_unit]
+    unit = ALIASES.get(unit, unit) or target_unit
+    if unit not in allowed:
+        found = f"[{unit}] of column {name!r}"
+        raise HaltereError(f"a unit that can be turned into {target_unit}", found, str(path), f"known: {', '.join(allowed)}")
+    values = to_column(table[name], path)
+    if values.dtype.kind != "f":
+        bad = next((v for v in values.tolist() if not _is_number(v)), "")
+        raise HaltereError("numbers", f"{bad!r}", f"{path} column {name!r}", "map another column or clean the table")
+    factor, offset = allowed[unit]
+    return np.asarray(values * (factor if name == source else -factor) + offset, dtype=np.float64)
+
+
+def _is_number(text: str) -> bool:
+    try:
+        float(text or "nan")
+    except ValueError:
+        return False
+    return True

@@ -1,0 +1,183 @@
+"""State layouts and the parameter record as NumPy dtypes: what a filter remembers, and what it is told. No arithmetic.
+
+The first fifteen error states are the same in every layout, in this order: attitude (body), velocity (NED), position (NED),
+gyro bias, accelerometer bias; optional blocks follow. A layout is a dtype: kernels are generic over the record they are
+given, an absent block is a field of length zero, and one machine-code version is compiled for each layout in use.
+"""
+
+from __future__ import annotations
+
+from functools import cache
+
+import numpy as np
+
+__all__ = ["ALIGNMENT", "AID_STATE", "BA", "BG", "CORE", "EVENT", "IMU_SAMPLE", "LAST", "MEASUREMENT", "PARAMETERS", "POS", "REST", "THETA", "VEL", "layout"]
+
+#: First column of each core block. NumPy integers, since a plain one would compile a version of every function it is passed to.
+THETA, VEL, POS, BG, BA = (np.int64(i) for i in (0, 3, 6, 9, 12))
+#: Block that ends in column 15, the first one after the core: a single state there is ``(LAST, (0, 0, h))``.
+LAST = np.int64(13)
+#: Number of core error states.
+CORE = 15
+
+#: IMU samples that wait for the fusion horizon, and measurements a sensor.
+IMU_CAPACITY = 512
+MEASUREMENT_CAPACITY = 128
+EVENT_CAPACITY = 32
+
+
+def _record(*fields: tuple[object, ...]) -> np.dtype[np.void]:
+    """Nested record type that plain Python can also reach by attribute."""
+    return np.dtype((np.record, list(fields)), align=True)  # type: ignore[call-overload,no-any-return]
+
+
+IMU_SAMPLE = _record(("t", "f8"), ("w", "f8", 3), ("f", "f8", 3))
+
+#: A measurement: valid time, up to three values and their variances (NaN: not given).
+MEASUREMENT = _record(("t", "f8"), ("z", "f8", 3), ("r", "f8", 3))
+
+#: What the filter remembers of one sensor.
+AID_STATE = _record(
+    ("t_offered", "f8"),  # last measurement seen
+    ("t_passed", "f8"),  # last measurement that passed its test
+    ("t_due", "f8"),  # next time of a pseudo-measurement
+    ("started", "i8"),
+    ("n_fused", "i8"),
+    ("n_rejected", "i8"),
+    ("n_late", "i8"),
+    ("n_overflow", "i8"),
+)
+
+#: Statistics of the last second, in four blocks of a quarter: is the vehicle at rest?
+REST = _record(
+    ("block", "i8"),
+    ("filled", "i8"),
+    ("t_block", "f8"),
+    ("n", "f8", 4),
+    ("w", "f8", (4, 3)),
+    ("ww", "f8", (4, 3)),
+    ("f", "f8", (4, 3)),
+    ("a", "f8", 4),
+    ("aa", "f8", 4),
+    ("still", "i8"),
+    ("mean_w", "f8", 3),
+    ("mean_f", "f8", 3),
+    ("mean_a", "f8"),
+    ("moved", "i8"),
+)
+
+#: What initial alignment has gathered.
+ALIGNMENT = _record(
+    ("t_first", "f8"),
+    ("t_span", "f8"),
+    ("open", "i8"),
+    ("q", "f8", 4),  # body now to body at the start of the span
+    ("f", "f8", 3),  # integral of specific force over the span, in the body frame at its start
+    ("m", "f8", 3),  # sum of magnetometer samples, likewise
+    ("n_m", "f8"),
+    ("v", "f8", 3),  # GNSS velocity at the start of the span
+    ("gnss_v", "f8", 3),
+    ("gnss_v_sd", "f8", 3),
+    ("t_gnss_v", "f8"),
+    ("gnss_p", "f8", 3),
+    ("gnss_p_sd", "f8", 3),
+    ("t_gnss_p", "f8"),
+    ("baro", "f8"),
+    ("t_baro", "f8"),
+    ("n_baro", "f8"),
+    ("kind", "i8"),
+)
+
+EVENT = _record(("t", "f8"), ("code", "i8"), ("sensor", "i8"), ("value", "f8"))
+
+#: Every number a filter is told. Field ``noise_gyro`` is configuration key ``noise.gyro``.
+PARAMETERS = np.dtype(
+    [
+        (name, "f8")
+        for name in (
+            "noise_gyro noise_accel noise_gyro_bias noise_accel_bias noise_baro_bias "
+            "noise_gnss_velocity noise_gnss_position noise_gnss_altitude noise_gnss_velocity_min noise_gnss_position_min "
+            "noise_barometer noise_magnetometer "
+            "noise_zero_velocity noise_zero_rate noise_fake_position noise_fake_position_rest noise_fake_velocity "
+            "gate_gnss gate_barometer gate_magnetometer gate_zero_velocity gate_zero_rate "
+            "delay_gnss_velocity delay_gnss_position delay_barometer delay_magnetometer "
+            "aid_gnss aid_barometer aid_magnetometer aid_zero_velocity aid_zero_rate aid_fake_position aid_fake_velocity "
+            "timeout_gnss timeout_barometer timeout_magnetometer timeout_imu "
+            "arm_gnss_x arm_gnss_y arm_gnss_z "
+            "field_declination field_dip field_strength field_tolerance_strength field_tolerance_dip "
+            "init_tilt_rest init_tilt_motion init_yaw_compass init_yaw_unknown init_gyro_bias_rest init_gyro_bias "
+            "init_accel_bias init_velocity init_baro_bias "
+            "rest_gyro rest_accel rest_gravity "
+            "imu_mean horizon covariance_interval"
+        ).split()
+    ],
+    align=True,
+)
+
+
+@cache
+def layout(baro: int = 0) -> np.dtype[np.void]:
+    """State record type.
+
+    Parameters
+    ----------
+    baro
+        1 with the barometer offset as a state, else 0.
+
+    Returns
+    -------
+    numpy.dtype
+        Nominal state, covariance ``P`` (n, n), scratch, queues, monitors and counters: the whole memory of a filter.
+    """
+    n = CORE + baro
+    return np.dtype(
+        [
+            ("t", "f8"),
+            ("q", "f8", 4),
+            ("v", "f8", 3),
+            ("p", "f8", 3),
+            ("bg", "f8", 3),
+            ("ba", "f8", 3),
+            ("baro", "f8", (baro,)),
+            ("P", "f8", (n, n)),
+            ("dx", "f8", n),
+            ("u", "f8", n),
+            ("k", "f8", n),
+            ("w", "f8", 3),  # corrected angular rate of the last step
+            ("w_raw", "f8", 3),
+            ("f_raw", "f8", 3),
+            ("anchor", "f8", 3),  # last position that something held
+            ("gravity", "f8"),
+            ("origin", "f8", 3),
+            ("has_origin", "i8"),
+            ("field", "f8", 3),  # declination, dip [rad], strength [uT] in use
+            ("has_field", "i8"),
+            ("phase", "i8"),  # 0 nothing seen, 1 aligning, 2 running
+            ("n_aligned", "i8"),
+            ("t_aligned", "f8"),
+            ("t_newest", "f8"),
+            ("t_covariance", "f8"),
+            ("n_steps", "i8"),
+            ("n_unaligned", "i8"),
+            ("n_gaps", "i8"),
+            ("n_bad", "i8"),
+            ("n_ring_full", "i8"),
+            ("n_rows", "i8"),
+            ("n_cov", "i8"),
+            ("n_aids", "i8"),
+            ("n_aids_lost", "i8"),
+            ("n_events", "i8"),
+            ("n_events_lost", "i8"),
+            ("event", EVENT, (EVENT_CAPACITY,)),
+            ("aid", AID_STATE, (8,)),
+            ("rest", REST),
+            ("align", ALIGNMENT),
+            ("imu_head", "i8"),
+            ("imu_n", "i8"),
+            ("imu", IMU_SAMPLE, (IMU_CAPACITY,)),
+            ("ring_head", "i8", 4),
+            ("ring_n", "i8", 4),
+            ("ring", MEASUREMENT, (4, MEASUREMENT_CAPACITY)),
+        ],
+        align=True,
+    )

@@ -1,0 +1,174 @@
+"""Strapdown mechanisation and covariance propagation of one IMU interval, and the injection of a correction. No sensor aiding.
+
+Error state: q_true = q ⊗ δq(δθ) (body), everything else true minus estimate (theory.md §1, theory-amendments.md §8).
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+from haltere._jit import jit
+from haltere.core.rotation import Mat, Vec, cross, dcm, mat_vec, quat_from_rotvec, quat_mul, quat_unit, rotvec_dcm
+
+__all__ = ["inject", "left_F", "mechanise", "predict", "transpose"]
+
+
+@jit
+def mechanise(s: Any, rotation: Vec, dv_mid: Vec, dt: float) -> Mat:
+    """Advance attitude, velocity and position by one interval; return C_nb in the middle of it.
+
+    Parameters
+    ----------
+    s
+        State record.
+    rotation
+        Rotation vector over the interval, body frame [rad], bias removed.
+    dv_mid
+        Integral of specific force over the interval in the body frame of its middle [m/s], bias removed.
+    dt
+        Interval [s].
+    """
+    q = (s.q[0], s.q[1], s.q[2], s.q[3])
+    half = quat_from_rotvec((0.5 * rotation[0], 0.5 * rotation[1], 0.5 * rotation[2]))
+    q_mid = quat_mul(q, half)
+    C = dcm(q_mid)
+    dv = mat_vec(C, dv_mid)
+    q = quat_unit(quat_mul(q_mid, half))
+    s.q[0], s.q[1], s.q[2], s.q[3] = q
+    for i in range(3):
+        a = dv[i]
+        if i == 2:
+            a += s.gravity * dt
+        s.p[i] += dt * (s.v[i] + 0.5 * a)
+        s.v[i] += a
+    return C
+
+
+@jit
+def left_F(s: Any, D: Mat, A: Mat, B: Mat, dt: float) -> None:
+    """P <- Φ P, touching only the blocks of Φ that are not zero or one.
+
+    Parameters
+    ----------
+    D
+        Φ_θθ = R(ω dt)ᵀ.
+    A, B
+        Φ_vθ = -C [f]× dt and Φ_v,ba = -C dt.
+    dt
+        Interval [s].
+    """
+    P = s.P
+    for j in range(s.P.shape[0]):  # the long index outside: SIMD
+        t0, t1, t2 = P[0, j], P[1, j], P[2, j]
+        g0, g1, g2 = P[9, j], P[10, j], P[11, j]
+        b0, b1, b2 = P[12, j], P[13, j], P[14, j]
+        d0 = A[0][0] * t0 + A[0][1] * t1 + A[0][2] * t2 + B[0][0] * b0 + B[0][1] * b1 + B[0][2] * b2
+        d1 = A[1][0] * t0 + A[1][1] * t1 + A[1][2] * t2 + B[1][0] * b0 + B[1][1] * b1 + B[1][2] * b2
+        d2 = A[2][0] * t0 + A[2][1] * t1 + A[2][2] * t2 + B[2][0] * b0 + B[2][1] * b1 + B[2][2] * b2
+        P[6, j] += dt * (P[3, j] + 0.5 * d0)
+        P[7, j] += dt * (P[4, j] + 0.5 * d1)
+        P[8, j] += dt * (P[5, j] + 0.5 * d2)
+        P[3, j] += d0
+        P[4, j] += d1
+        P[5, j] += d2
+        P[0, j] = D[0][0] * t0 + D[0][1] * t1 + D[0][2] * t2 - dt * g0
+        P[1, j] = D[1][0] * t0 + D[1][1] * t1 + D[1][2] * t2 - dt * g1
+        P[2, j] = D[2][0] * t0 + D[2][1] * t1 + D[2][2] * t2 - dt * g2
+
+
+@jit
+def transpose(s: Any) -> None:
+    """P <- Pᵀ in place."""
+    P = s.P
+    for i in range(s.P.shape[0]):
+        for j in range(i):
+            P[i, j], P[j, i] = P[j, i], P[i, j]
+
+
+@jit
+def predict(s: Any, prm: Any, w: Vec, f: Vec, rotation: Vec, dv_mid: Vec, dt: float) -> None:
+    """Advance nominal state and covariance by one interval (theory-amendments.md §8).
+
+    Parameters
+    ----------
+    s, prm
+        State and parameter records.
+    w, f
+        Mean angular rate and specific force of the interval, bias removed [rad/s, m/s^2].
+    rotation, dv_mid
+        Rotation vector and velocity increment, see `mechanise`.
+    dt
+        Interval [s].
+    """
+    C = mechanise(s, rotation, dv_mid, dt)
+    s.w[0], s.w[1], s.w[2] = w
+    Dt = rotvec_dcm((-rotation[0], -rotation[1], -rotation[2]))
+    # -C [f]x: column j is -C (f x e_j)
+    fx, fy, fz = dt * f[0], dt * f[1], dt * f[2]
+    A = (
+        (C[0][2] * fy - C[0][1] * fz, C[0][0] * fz - C[0][2] * fx, C[0][1] * fx - C[0][0] * fy),
+        (C[1][2] * fy - C[1][1] * fz, C[1][0] * fz - C[1][2] * fx, C[1][1] * fx - C[1][0] * fy),
+        (C[2][2] * fy - C[2][1] * fz, C[2][0] * fz - C[2][2] * fx, C[2][1] * fx - C[2][0] * fy),
+    )
+    B = (
+        (-dt * C[0][0], -dt * C[0][1], -dt * C[0][2]),
+        (-dt * C[1][0], -dt * C[1][1], -dt * C[1][2]),
+        (-dt * C[2][0], -dt * C[2][1], -dt * C[2][2]),
+    )
+    left_F(s, Dt, A, B, dt)
+    transpose(s)
+    left_F(s, Dt, A, B, dt)
+
+    P = s.P
+    qg, qbg = prm.noise_gyro * prm.noise_gyro, prm.noise_gyro_bias * prm.noise_gyro_bias
+    qa, qba = prm.noise_accel * prm.noise_accel, prm.noise_accel_bias * prm.noise_accel_bias
+    q_theta, q_v, q_p = qg * dt + qbg * dt * dt * dt / 3.0, qa * dt, qa * dt * dt * dt / 3.0
+    for i in range(3):
+        P[i, i] += q_theta
+        P[3 + i, 3 + i] += q_v
+        P[6 + i, 6 + i] += q_p
+        P[9 + i, 9 + i] += qbg * dt
+        P[12 + i, 12 + i] += qba * dt
+    for i in range(len(s.baro)):
+        P[15 + i, 15 + i] += prm.noise_baro_bias * prm.noise_baro_bias * dt
+    if dt > 0.02:  # below that the off-diagonal blocks are lost in the noise (theory-amendments.md §8)
+        for i in range(3):
+            c = -0.5 * qbg * dt * dt
+            P[i, 9 + i] += c
+            P[9 + i, i] += c
+            c = 0.5 * qa * dt * dt
+            P[3 + i, 6 + i] += c
+            P[6 + i, 3 + i] += c
+            for j in range(3):
+                c = -0.5 * qba * dt * dt * C[i][j]
+                P[3 + i, 12 + j] += c
+                P[12 + j, 3 + i] += c
+
+
+@jit
+def inject(s: Any) -> None:
+    """Move the correction ``s.dx`` into the nominal state, reset it, and turn P with it: G_θθ = I - ½[δθ]×."""
+    dx, P = s.dx, s.P
+    n = s.P.shape[0]
+    t = (dx[0], dx[1], dx[2])
+    q = quat_unit(quat_mul((s.q[0], s.q[1], s.q[2], s.q[3]), quat_from_rotvec(t)))
+    s.q[0], s.q[1], s.q[2], s.q[3] = q
+    for i in range(3):
+        s.v[i] += dx[3 + i]
+        s.p[i] += dx[6 + i]
+        s.bg[i] += dx[9 + i]
+        s.ba[i] += dx[12 + i]
+    for i in range(len(s.baro)):
+        s.baro[i] += dx[15 + i]
+    for j in range(n):
+        c = cross(t, (P[0, j], P[1, j], P[2, j]))
+        P[0, j] -= 0.5 * c[0]
+        P[1, j] -= 0.5 * c[1]
+        P[2, j] -= 0.5 * c[2]
+    for j in range(n):
+        c = cross(t, (P[j, 0], P[j, 1], P[j, 2]))
+        P[j, 0] -= 0.5 * c[0]
+        P[j, 1] -= 0.5 * c[1]
+        P[j, 2] -= 0.5 * c[2]
+    for i in range(n):
+        dx[i] = 0.0
