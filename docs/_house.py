@@ -20,9 +20,10 @@ def _contracts() -> list[dict[str, list[str]]]:
 
 
 def _layers() -> list[list[str]]:
-    """Rooms by floor, the highest first."""
+    """Rooms by floor, the highest first; a room in brackets is planned and may not be there yet."""
     rows = next(c["layers"] for c in _contracts() if "layers" in c)
-    return [[room.strip(" ()") for room in row.split("|")] for row in rows]
+    floors = [[room.strip(" ()") for room in row.split("|")] for row in rows]
+    return [there for floor in floors if (there := [room for room in floor if _files(room)])]
 
 
 def _tower(name: str) -> set[str]:

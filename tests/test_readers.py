@@ -16,7 +16,7 @@ from haltere.flight.log import FlightLog, Stream
 from haltere.flight.schema import NAVIGATION_STREAMS, base_name
 from haltere.readers import format_of, read
 from haltere.readers._dataflash import DataFlash
-from haltere.readers.px4 import Log
+from haltere.readers._ulog import Log
 
 ULOGS = (
     *("sample.ulg", "sample_appended_multiple.ulg", "sample_log_small.ulg"),

@@ -121,6 +121,12 @@ def test_tables_that_cannot_be_used_are_told(tmp_path: Path, text: str, said: st
     assert str(path) in str(caught.value)
 
 
+def test_row_numbers_without_a_name_are_passed_over(tmp_path: Path) -> None:
+    path = tmp_path / "log.csv"
+    path.write_text(",t,gyro_x\n0,0.5,1\n1,0.6,2\n")
+    assert read(path)["imu"]["gyro_x"].tolist() == [1.0, 2.0]
+
+
 def test_rows_without_time_are_counted(tmp_path: Path) -> None:
     path = tmp_path / "log.csv"
     path.write_text("t,gyro_x\n0,1\n,2\nnan,3\n3,4\n")

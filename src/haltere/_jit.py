@@ -13,15 +13,22 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import TypeVar, cast
 
+import numpy as np
+
 F = TypeVar("F", bound=Callable[..., object])
 
-__all__ = ["COMPILED", "cache_folder", "jit"]
+__all__ = ["COMPILED", "cache_folder", "constant", "jit"]
 
 #: False under ``HALTERE_JIT=0``.
 COMPILED = os.environ.get("HALTERE_JIT", "1") != "0"
 
 #: Packages whose sources are compiled; a change in any of them makes a new cache folder.
 _KERNEL_ROOMS = ("core", "filter", "strapdown", "aids", "diagnosis", "estimators", "_jit.py")
+
+
+def constant(value: int) -> int:
+    """Integer for use in kernels that is no literal: of every plain integer argument a version of its own would be compiled."""
+    return cast(int, np.int64(value))
 
 
 def cache_folder() -> Path:

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from haltere.aids.record import AID_RECORD, COMPONENTS, EVENTS, N_QUEUED, REASONS, SENSORS, STATUSES
+from haltere.aids.record import AID_RECORD, COMPONENTS, EVENTS, N_QUEUED, REASONS, SENSORS, STATUSES, YAW_BANK
 from haltere.errors import HaltereError, UsageError
 from haltere.estimators import step as kernels
 from haltere.estimators.base import InitialState, new_state
@@ -122,8 +122,15 @@ def run(
 
 
 def _loop(
-    S: NDArray[np.void], prm: NDArray[np.void], t: FloatArray, gyro: FloatArray, accel: FloatArray, m: Measurements, rows: FloatArray,
-    cov: FloatArray, progress: Callable[[float], None] | None,
+    S: NDArray[np.void],
+    prm: NDArray[np.void],
+    t: FloatArray,
+    gyro: FloatArray,
+    accel: FloatArray,
+    m: Measurements,
+    rows: FloatArray,
+    cov: FloatArray,
+    progress: Callable[[float], None] | None,
 ) -> tuple[list[NDArray[np.void]], list[dict[str, Any]]]:
     """Drive the compiled step over the whole log, draining records and events between chunks."""
     aids = np.empty(AID_ROOM, AID_RECORD)
@@ -148,15 +155,15 @@ def _drain(S: NDArray[np.void], aids: NDArray[np.void], parts: list[NDArray[np.v
     for e in S["event"][0, : int(S["n_events"][0])]:
         kind = EVENTS[int(e["code"])]
         sensor = SENSORS[int(e["sensor"])] if kind in ("reset", "timeout", "recovered") else ("imu" if kind == "gap" else "filter")
-        events.append(_event(kind, sensor, float(e["t"]), float(e["value"])))
+        events.append(_event(kind, sensor, float(e["t"]), float(e["value"]), int(e["sensor"]) == YAW_BANK))
     S["n_events"] = 0
 
 
-def _event(kind: str, sensor: str, t: float, value: float) -> dict[str, Any]:
+def _event(kind: str, sensor: str, t: float, value: float, bank: bool) -> dict[str, Any]:
     evidence = {
         "aligned": "initial alignment " + {1: "at rest", 2: "in motion, from GNSS velocity", 3: "from gravity alone"}.get(int(value), ""),
         "realigned": "aligned anew " + {1: "at rest", 2: "in motion, from GNSS velocity", 3: "from gravity alone"}.get(int(value), ""),
-        "reset": "first measurement sets the state",
+        "reset": f"yaw set from GNSS velocity, turned by {math.degrees(value):.0f} deg" if bank else "first measurement sets the state",
         "timeout": f"refused for {value:.1f} s, let in again at the gate's edge",
         "gap": f"{value:.2f} s without IMU samples",
         "diverged": "state or covariance not finite or not positive",
@@ -219,7 +226,7 @@ def _euler_sd(q: FloatArray, P: FloatArray) -> tuple[FloatArray, FloatArray, Flo
 def _decimate(t: FloatArray, rate: float) -> NDArray[np.bool_]:
     """First row of each interval of 1/rate."""
     slot = np.floor((t - t[0]) * rate + 1e-6)
-    return np.r_[True, np.diff(slot) > 0.0]
+    return np.asarray(np.r_[True, np.diff(slot) > 0.0], dtype=np.bool_)
 
 
 def _aid_table(parts: list[NDArray[np.void]]) -> dict[str, NDArray[Any]]:
@@ -248,7 +255,14 @@ def _covariance(cov: FloatArray, n: int) -> dict[str, FloatArray]:
 
 
 def _facts(
-    flight: FlightLog, checked: Checked, S: NDArray[np.void], m: Measurements, n: int, t: FloatArray, began: float, prepared: float,
+    flight: FlightLog,
+    checked: Checked,
+    S: NDArray[np.void],
+    m: Measurements,
+    n: int,
+    t: FloatArray,
+    began: float,
+    prepared: float,
     filtered: float,
 ) -> dict[str, Any]:
     """What only the run knows, for the summary."""

@@ -54,8 +54,7 @@ def due(s: Any, prm: Any, sensor: int, w: Vec, f: Vec) -> bool:
     a = s.aid[sensor]
     if s.t < a.t_due:
         return False
-    at_rest = sensor == ZERO_VELOCITY or sensor == ZERO_RATE
-    a.t_due = s.t + (0.1 if at_rest else 0.2) - 1e-6
+    a.t_due = s.t + (0.1 if sensor in (ZERO_VELOCITY, ZERO_RATE) else 0.2) - 1e-6
     if sensor == ZERO_VELOCITY:
         return prm.aid_zero_velocity > 0.0 and rest.at_rest(s, prm, w, f)
     if sensor == ZERO_RATE:

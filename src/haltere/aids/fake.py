@@ -9,7 +9,6 @@ from haltere.aids.fusing import NO_GATE, NO_TIMEOUT, THREE, ZEROS, Offer, unit_r
 from haltere.aids.record import C_POS, C_VEL, GNSS_POSITION, R_NONE
 from haltere.strapdown.layout import POS, VEL
 
-
 __all__ = ["offer_position", "offer_velocity", "position_is_lost"]
 
 

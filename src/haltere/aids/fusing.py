@@ -5,13 +5,13 @@ from __future__ import annotations
 import math
 from typing import Any
 
-import numpy as np
-
-from haltere._jit import jit
+from haltere._jit import constant, jit
 from haltere.aids.record import (
     DEWEIGHTED,
     E_TIMEOUT,
     FUSED,
+    HELD,
+    R_DISTRUSTED,
     R_INNOVATION,
     R_NONE,
     R_TIMEOUT,
@@ -24,7 +24,7 @@ from haltere.filter.gates import ABSENT, inflation, joint_nis, optimal_gain
 from haltere.filter.update import NONE, Row, apply, innovation, project, symmetrise, variance
 from haltere.strapdown.propagate import inject
 
-__all__ = ["NOTHING", "NO_GATE", "NO_TIMEOUT", "Offer", "fuse_offer", "judge", "unit_rows"]
+__all__ = ["DISTRUSTED", "NOTHING", "NO_GATE", "NO_TIMEOUT", "Offer", "fuse_offer", "judge", "unit_rows"]
 
 #: What an aid has to say of one measurement, the same shape for all, so that one machine-code version fuses them all:
 #: number of components (0: nothing to fuse), code of the first, observations z, their predictions h, variances r, rows of H,
@@ -33,8 +33,10 @@ Offer = tuple[int, int, Vec, Vec, Vec, tuple[Row, Row, Row], float, float, int, 
 
 NO_GATE, NO_TIMEOUT = 1e9, 1e18
 #: What ``started`` says of a sensor.
-RUNNING, FORCED = 1, 3
-ZERO, ONE, THREE = (np.int64(i) for i in (0, 1, 3))
+RUNNING, FORCED, DISTRUSTED = (constant(i) for i in (1, 3, 4))
+#: How long a distrusted sensor must pass before it is believed again [s].
+PROBATION = 10.0
+ZERO, ONE, THREE = (constant(i) for i in (0, 1, 3))
 ZEROS = (0.0, 0.0, 0.0)
 #: An offer of nothing.
 NOTHING = (ZERO, ZERO, ZEROS, ZEROS, ZEROS, ((NONE, NONE, NONE), (NONE, NONE, NONE), (NONE, NONE, NONE)), 1.0, 1.0, ZERO, False)
@@ -56,12 +58,21 @@ def judge(s: Any, sensor: int, t: float, ratio: float, timeout: float, reason: i
 
     Continues while the ratio is at most one. After ``timeout`` [s] of refusals by the innovation the measurement is let in
     with its variance inflated until the ratio is one: the state is drawn to it without a jump. ``reason`` other than
-    `R_NONE` refuses it whatever the ratio.
+    `R_NONE` refuses it whatever the ratio. A sensor found wrong by another is not let in by force, and is believed again only
+    when it has passed for `PROBATION` without a break.
     """
     a = s.aid[sensor]
     if reason != R_NONE:
         a.n_rejected += 1
+        a.t_due = t  # for a queued sensor: since when it has passed without a break
         return REJECTED, reason, 0.0
+    if a.started == DISTRUSTED:
+        if ratio > 1.0:
+            a.t_due = t
+            a.n_rejected += 1
+            return REJECTED, R_INNOVATION, 0.0
+        if t - a.t_due < PROBATION:
+            return HELD, R_DISTRUSTED, 0.0
     if ratio <= 1.0:
         a.t_passed = t
         a.started = RUNNING
@@ -109,7 +120,7 @@ def fuse_offer(s: Any, aids: Any, t: float, sensor: int, offer: Offer) -> None:
     status, reason, weight = judge(s, sensor, t, ratio, timeout, reason)
     if status == DEWEIGHTED:
         r = (inflation(nis, gate, s_ii[0], r[0]), inflation(nis, gate, s_ii[1], r[1]), inflation(nis, gate, s_ii[2], r[2]))
-    if status != REJECTED:
+    if weight > 0.0:
         for i in range(3):
             row, r_i, e_i, ok = H0, r[0], e[0], ok0
             if i == 1:

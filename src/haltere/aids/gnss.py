@@ -78,8 +78,9 @@ def offer_velocity(s: Any, prm: Any, m: Any) -> Offer:
         ((THETA, T[2]), (VEL, ONES[2]), (BG, B[2])),
     )
     h = (s.v[0] + offset[0], s.v[1] + offset[1], s.v[2] + offset[2])
-    z = (m.z[0], m.z[1], m.z[2])
-    return THREE, C_VEL, z, h, velocity_variance(prm, m.r), H, prm.gate_gnss, prm.timeout_gnss, R_NONE, False
+    z, r = (m.z[0], m.z[1], m.z[2]), velocity_variance(prm, m.r)
+    s.yaw.z[0], s.yaw.z[1], s.yaw.r, s.yaw.fresh = z[0] - offset[0], z[1] - offset[1], r[0], 1
+    return THREE, C_VEL, z, h, r, H, prm.gate_gnss, prm.timeout_gnss, R_NONE, False
 
 
 @jit

@@ -67,6 +67,7 @@ def reset_yaw(s: Any, delta: float, sd: float) -> None:
     """Turn the attitude by ``delta`` [rad] about the vertical; the error about it becomes ``sd`` and independent of the rest."""
     q = quat_unit(quat_mul(quat_from_rotvec((0.0, 0.0, delta)), (s.q[0], s.q[1], s.q[2], s.q[3])))
     s.q[0], s.q[1], s.q[2], s.q[3] = q
+    s.yaw_corrected += delta
     C = dcm(q)
     d = C[2]
     P = s.P

@@ -6,27 +6,44 @@ from typing import Any
 
 import numpy as np
 
-from haltere._jit import jit
+from haltere._jit import constant, jit
 
 __all__ = ["AID_RECORD", "COMPONENTS", "EVENTS", "REASONS", "SENSORS", "STATUSES", "event", "record"]
 
-#: Codes are NumPy integers, since a plain one would compile a version of every function it is passed to.
-#: Sensor codes, and indices of the filter's memory of each sensor. The first four arrive from outside and are queued.
-GNSS_VELOCITY, GNSS_POSITION, BAROMETER, MAGNETOMETER, ZERO_VELOCITY, ZERO_RATE, FAKE_POSITION, FAKE_VELOCITY = (np.int64(i) for i in range(8))
+#: Sensor codes, and indices of the filter's memory of each sensor. The first four arrive from outside and are queued; the last
+#: is the bank of yaw hypotheses, which speaks of GNSS velocity.
+GNSS_VELOCITY, GNSS_POSITION, BAROMETER, MAGNETOMETER, ZERO_VELOCITY, ZERO_RATE, FAKE_POSITION, FAKE_VELOCITY, YAW_BANK = (
+    constant(i) for i in range(9)
+)
 N_QUEUED = 4
-SENSORS = ("gnss", "gnss", "barometer", "magnetometer", "zero_velocity", "zero_rate", "fake_position", "fake_velocity")
+SENSORS = ("gnss", "gnss", "barometer", "magnetometer", "zero_velocity", "zero_rate", "fake_position", "fake_velocity", "gnss")
 
-COMPONENTS = ("vel_n", "vel_e", "vel_d", "pos_n", "pos_e", "pos_d", "altitude", "heading", "mag_x", "mag_y", "mag_z", "rate_x", "rate_y", "rate_z")
-C_VEL, C_POS, C_ALTITUDE, C_HEADING, C_MAG, C_RATE = (np.int64(i) for i in (0, 3, 6, 7, 8, 11))
+COMPONENTS = (
+    "vel_n",
+    "vel_e",
+    "vel_d",
+    "pos_n",
+    "pos_e",
+    "pos_d",
+    "altitude",
+    "heading",
+    "mag_x",
+    "mag_y",
+    "mag_z",
+    "rate_x",
+    "rate_y",
+    "rate_z",
+)
+C_VEL, C_POS, C_ALTITUDE, C_HEADING, C_MAG, C_RATE = (constant(i) for i in (0, 3, 6, 7, 8, 11))
 
 STATUSES = ("fused", "deweighted", "rejected", "held")
-FUSED, DEWEIGHTED, REJECTED, HELD = (np.int64(i) for i in range(4))
+FUSED, DEWEIGHTED, REJECTED, HELD = (constant(i) for i in range(4))
 
-REASONS = ("", "innovation", "timeout", "start", "field strength", "dip", "no horizontal field", "alignment")
-R_NONE, R_INNOVATION, R_TIMEOUT, R_START, R_STRENGTH, R_DIP, R_HORIZONTAL, R_ALIGNMENT = (np.int64(i) for i in range(8))
+REASONS = ("", "innovation", "timeout", "start", "field strength", "dip", "no horizontal field", "alignment", "distrusted")
+R_NONE, R_INNOVATION, R_TIMEOUT, R_START, R_STRENGTH, R_DIP, R_HORIZONTAL, R_ALIGNMENT, R_DISTRUSTED = (constant(i) for i in range(9))
 
 EVENTS = ("aligned", "reset", "diverged", "realigned", "gap", "recovered", "timeout")
-E_ALIGNED, E_RESET, E_DIVERGED, E_REALIGNED, E_GAP, E_RECOVERED, E_TIMEOUT = (np.int64(i) for i in range(7))
+E_ALIGNED, E_RESET, E_DIVERGED, E_REALIGNED, E_GAP, E_RECOVERED, E_TIMEOUT = (constant(i) for i in range(7))
 
 AID_RECORD = np.dtype(
     [
@@ -47,8 +64,18 @@ AID_RECORD = np.dtype(
 
 @jit
 def record(
-    s: Any, aids: Any, t: float, sensor: int, component: int, observation: float, innovation: float, sd: float, ratio: float,
-    weight: float, status: int, reason: int,
+    s: Any,
+    aids: Any,
+    t: float,
+    sensor: int,
+    component: int,
+    observation: float,
+    innovation: float,
+    sd: float,
+    ratio: float,
+    weight: float,
+    status: int,
+    reason: int,
 ) -> None:
     """Append one record; without room it is counted, not lost silently."""
     i = s.n_aids

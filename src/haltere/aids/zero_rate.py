@@ -10,7 +10,6 @@ from haltere.aids.record import C_RATE, R_NONE
 from haltere.core.rotation import Vec
 from haltere.strapdown.layout import BG
 
-
 __all__ = ["offer"]
 
 

@@ -9,7 +9,6 @@ from haltere.aids.fusing import NO_TIMEOUT, THREE, ZEROS, Offer, unit_rows
 from haltere.aids.record import C_VEL, R_NONE
 from haltere.strapdown.layout import VEL
 
-
 __all__ = ["offer"]
 
 

@@ -32,9 +32,7 @@ def radii(lat: float) -> tuple[float, float]:
 
 
 @jit
-def local_from_geodetic(
-    lat: float, lon: float, alt: float, lat0: float, lon0: float, alt0: float
-) -> tuple[float, float, float]:
+def local_from_geodetic(lat: float, lon: float, alt: float, lat0: float, lon0: float, alt0: float) -> tuple[float, float, float]:
     """Position north, east, down [m] from the origin (degrees, metres), along the curves of the ellipsoid.
 
     Down is the difference of altitudes, so that it agrees with a barometer at any distance (theory.md §4.6, corrected sign).
@@ -50,9 +48,7 @@ def local_from_geodetic(
 
 
 @jit
-def geodetic_from_local(
-    north: float, east: float, down: float, lat0: float, lon0: float, alt0: float
-) -> tuple[float, float, float]:
+def geodetic_from_local(north: float, east: float, down: float, lat0: float, lon0: float, alt0: float) -> tuple[float, float, float]:
     """Latitude, longitude [deg] and altitude [m]: inverse of `local_from_geodetic`."""
     m, n = radii(lat0)
     lat = lat0 + north / (DEG * (m + alt0))

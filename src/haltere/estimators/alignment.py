@@ -9,10 +9,9 @@ from __future__ import annotations
 import math
 from typing import Any
 
-import numpy as np
-
-from haltere._jit import jit
+from haltere._jit import constant, jit
 from haltere.aids import rest
+from haltere.aids.fusing import DISTRUSTED, RUNNING
 from haltere.aids.gnss import position_observation, position_variance, velocity_variance
 from haltere.aids.magnetometer import learn_field
 from haltere.aids.record import (
@@ -25,12 +24,27 @@ from haltere.aids.record import (
     N_QUEUED,
     event,
 )
-from haltere.core.rotation import Vec, dcm, dot, euler, mat_vec, norm, quat_from_euler, quat_from_rotvec, quat_mul, quat_unit, tmat_vec, triad, wrap
+from haltere.core.rotation import (
+    Vec,
+    dcm,
+    dot,
+    euler,
+    mat_vec,
+    norm,
+    quat_from_euler,
+    quat_from_rotvec,
+    quat_mul,
+    quat_unit,
+    tmat_vec,
+    triad,
+    wrap,
+)
+from haltere.estimators import yaw_bank
 from haltere.filter.queue import pop_due
 
 __all__ = ["AT_REST", "GRAVITY_ONLY", "IN_MOTION", "begin", "gather", "level_and_compass"]
 
-AT_REST, IN_MOTION, GRAVITY_ONLY = (np.int64(i) for i in (1, 2, 3))
+AT_REST, IN_MOTION, GRAVITY_ONLY = (constant(i) for i in (1, 2, 3))
 #: Longest wait [s] for a compass at rest, and for GNSS or rest before gravity alone must do.
 WAIT_COMPASS, WAIT_GRAVITY = 2.0, 5.0
 #: Length of the span [s] over which motion is compared, and after which it is given up.
@@ -61,6 +75,7 @@ def begin(s: Any, t: float) -> None:
         s.aid[k].t_due = t
         s.aid[k].t_passed = t
     rest.forget(s)
+    yaw_bank.forget(s)
     s.rest.moved = 0
     open_span(s, t)
 
@@ -199,7 +214,7 @@ def start(s: Any, prm: Any, kind: int, f_b: Vec, a_n: Vec) -> None:
     s.aid[GNSS_VELOCITY].started = 1 if recent_v else 0
     s.aid[GNSS_POSITION].started = 1 if recent_p else 0
     s.aid[BAROMETER].started = 1 if s.t - a.t_baro < 2.0 else 0
-    s.aid[MAGNETOMETER].started = 1 if passed else 0
+    s.aid[MAGNETOMETER].started = RUNNING if passed else (DISTRUSTED if has_m else 0)
     a.kind = kind
     s.phase = 2
     s.t_aligned = s.t

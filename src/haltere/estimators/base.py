@@ -131,7 +131,13 @@ def _begin_from(record: NDArray[np.void], initial: InitialState) -> None:
     if not np.allclose(P, P.T, rtol=1e-9, atol=1e-15) or np.linalg.eigvalsh(P).min() <= 0.0:
         raise HaltereError("a symmetric positive covariance", "one that is not", "initial state")
     record["t"] = initial.t
-    for name, values in (("q", initial.q_nb), ("v", initial.vel_n), ("p", initial.pos_n), ("bg", initial.gyro_bias_b), ("ba", initial.accel_bias_b)):
+    for name, values in (
+        ("q", initial.q_nb),
+        ("v", initial.vel_n),
+        ("p", initial.pos_n),
+        ("bg", initial.gyro_bias_b),
+        ("ba", initial.accel_bias_b),
+    ):
         record[name][0] = values
     if n > CORE:
         record["baro"][0, 0] = initial.baro_bias
@@ -166,7 +172,9 @@ class Estimator:
     ...     state = est.step(0.001 * k, (0.0, 0.0, 0.0), (0.0, 0.0, -9.80665))
     """
 
-    def __init__(self, name: str = "navigator", config: Config | Mapping[str, Any] | None = None, initial: InitialState | None = None) -> None:
+    def __init__(
+        self, name: str = "navigator", config: Config | Mapping[str, Any] | None = None, initial: InitialState | None = None
+    ) -> None:
         if isinstance(config, Config):
             if config.estimator != name:
                 raise UsageError(f"a configuration of {name}", f"one of {config.estimator}", "Estimator")
@@ -230,7 +238,10 @@ class Estimator:
             v = _in_order(sensor, values, names, 3)
             r = tuple(variances) if variances is not None else ()
             if isinstance(values, Mapping) and variances is None:
-                r = tuple(x * x if x > 0.0 else math.nan for x in (values.get(k, math.nan) for k in ("h_acc", "h_acc", "v_acc", "s_acc", "s_acc", "s_acc")))
+                r = tuple(
+                    x * x if x > 0.0 else math.nan
+                    for x in (values.get(k, math.nan) for k in ("h_acc", "h_acc", "v_acc", "s_acc", "s_acc", "s_acc"))
+                )
             r = r + (math.nan,) * (6 - len(r))
             taken = False
             if math.isfinite(v[3] + v[4]):

@@ -42,7 +42,11 @@ class Measurements:
 
 
 def configure(
-    flight: FlightLog, checked: Checked, estimator: str, preset: str = "default", config: Config | Mapping[str, Any] | str | Path | None = None,
+    flight: FlightLog,
+    checked: Checked,
+    estimator: str,
+    preset: str = "default",
+    config: Config | Mapping[str, Any] | str | Path | None = None,
     overrides: Mapping[str, Any] | None = None,
 ) -> Config:
     """Complete configuration of a run: defaults, then the flight's own, then a file or mapping, then single overrides.
@@ -153,9 +157,9 @@ def measurements(flight: FlightLog, checked: Checked, config: Config) -> Measure
     if gnss is not None and config["aid.gnss"] == "on":
         v, r_v = gnss.vector("vel", "ned"), _variances(gnss, "s_acc", "s_acc", "s_acc")
         p, r_p = np.column_stack([gnss.get(c) for c in ("lat", "lon", "alt")]), _variances(gnss, "h_acc", "h_acc", "v_acc")
-        for kind, z, r in ((GNSS_VELOCITY, v, r_v), (GNSS_POSITION, p, r_p)):
-            there = np.isfinite(z[:, :2]).all(axis=1)
-            parts.append((kind, gnss.t[there], z[there], r[there]))
+        for code, values, variances in ((GNSS_VELOCITY, v, r_v), (GNSS_POSITION, p, r_p)):
+            there = np.isfinite(values[:, :2]).all(axis=1)
+            parts.append((code, gnss.t[there], values[there], variances[there]))
     baro = checked.streams.get("barometer")
     if baro is not None and config["aid.barometer"] == "on" and config["baro.offset"] == "on":
         pressure = baro.get("pressure")

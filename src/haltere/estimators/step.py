@@ -18,7 +18,7 @@ from haltere.aids.record import (
     event,
 )
 from haltere.core.rotation import Vec, cross, dcm, mat_vec, quat_from_rotvec, quat_mul
-from haltere.estimators import alignment
+from haltere.estimators import alignment, yaw_bank
 from haltere.filter.queue import pop_imu, push, push_imu
 from haltere.strapdown.propagate import predict
 
@@ -121,7 +121,10 @@ def predict_interval(s: Any, prm: Any, w0: Vec, f0: Vec, w1: Vec, f1: Vec, dt: f
     coning = cross(a, b)
     s1, s2 = cross(a, g), cross(h, b)
     predict(
-        s, prm, w, f,
+        s,
+        prm,
+        w,
+        f,
         (w[0] * dt + k * coning[0], w[1] * dt + k * coning[1], w[2] * dt + k * coning[2]),
         (f[0] * dt + k * (s1[0] + s2[0]), f[1] * dt + k * (s1[1] + s2[1]), f[2] * dt + k * (s1[2] + s2[2])),
         dt,
@@ -136,7 +139,8 @@ def bridge_gap(s: Any, prm: Any, w0: Vec, f0: Vec, w1: Vec, f1: Vec, dt: float) 
     for i in range(n):
         k0, k1 = i / n, (i + 1) / n
         predict_interval(
-            s, prm,
+            s,
+            prm,
             (w0[0] + k0 * (w1[0] - w0[0]), w0[1] + k0 * (w1[1] - w0[1]), w0[2] + k0 * (w1[2] - w0[2])),
             (f0[0] + k0 * (f1[0] - f0[0]), f0[1] + k0 * (f1[1] - f0[1]), f0[2] + k0 * (f1[2] - f0[2])),
             (w0[0] + k1 * (w1[0] - w0[0]), w0[1] + k1 * (w1[1] - w0[1]), w0[2] + k1 * (w1[2] - w0[2])),
@@ -187,7 +191,8 @@ def advance(s: Any, prm: Any, rows: Any, cov: Any, aids: Any) -> None:
         else:
             k = 0.5 * dt
             alignment.gather(
-                s, prm,
+                s,
+                prm,
                 (k * (w0[0] + w1[0]), k * (w0[1] + w1[1]), k * (w0[2] + w1[2])),
                 (k * (f0[0] + f1[0]), k * (f0[1] + f1[1]), k * (f0[2] + f1[2])),
                 dt,
@@ -197,11 +202,18 @@ def advance(s: Any, prm: Any, rows: Any, cov: Any, aids: Any) -> None:
             return
         s.t_covariance = t
     else:
+        north, east = s.v[0], s.v[1]
         if dt > LONG_STEP:
             bridge_gap(s, prm, w0, f0, w1, f1, dt)
         else:
             predict_interval(s, prm, w0, f0, w1, f1, dt)
+        s.yaw.dv[0] += s.v[0] - north
+        s.yaw.dv[1] += s.v[1] - east
         fuse_all(s, prm, aids, dt, w1, f1)
+        if s.yaw.fresh == 1:
+            s.yaw.fresh = 0
+            if prm.aid_yaw_bank > 0.0:
+                yaw_bank.update(s, s.yaw.z[0], s.yaw.z[1], s.yaw.r)
     if t >= s.t_covariance and not sound(s):
         event(s, t, E_DIVERGED, 0, 0.0)
         alignment.begin(s, t)
@@ -276,8 +288,21 @@ def offer(S: Any, PRM: Any, kind: int, t: float, z: Vec, r: Vec) -> int:
 
 @jit
 def run_chunk(
-    S: Any, PRM: Any, t: Any, gyro: Any, accel: Any, i: int, i_end: int, kinds: Any, stamps: Any, z: Any, r: Any, j: int,
-    rows: Any, cov: Any, aids: Any,
+    S: Any,
+    PRM: Any,
+    t: Any,
+    gyro: Any,
+    accel: Any,
+    i: int,
+    i_end: int,
+    kinds: Any,
+    stamps: Any,
+    z: Any,
+    r: Any,
+    j: int,
+    rows: Any,
+    cov: Any,
+    aids: Any,
 ) -> tuple[int, int]:
     """Drive `offer` and `step` over IMU samples i ... i_end - 1 and the measurements stamped at or before them.
 

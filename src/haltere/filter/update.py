@@ -8,9 +8,7 @@ from __future__ import annotations
 
 from typing import Any
 
-import numpy as np
-
-from haltere._jit import jit
+from haltere._jit import constant, jit
 
 __all__ = ["NONE", "Row", "apply", "column_of", "innovation", "project", "symmetrise", "variance"]
 
@@ -18,7 +16,7 @@ Block = tuple[int, tuple[float, float, float]]
 Row = tuple[Block, Block, Block]
 
 #: A block that is not there.
-NONE = (np.int64(0), (0.0, 0.0, 0.0))
+NONE = (constant(0), (0.0, 0.0, 0.0))
 
 
 @jit

@@ -78,7 +78,9 @@ KEYS: dict[str, Key] = {
     "noise.zero_rate": _positive(0.01, "rad/s", "Zero rate at rest, 1 sigma at 10 Hz."),
     "noise.fake_position": _positive(10.0, "m", "Fake position in flight, 1 sigma at 5 Hz."),
     "noise.fake_position_rest": _positive(0.5, "m", "Fake position at rest, 1 sigma at 5 Hz."),
-    "noise.fake_velocity": _positive(2.0, "m/s", "Fake velocity of ahrs, 1 sigma at 5 Hz. Lower trusts gravity more, and accelerations less."),
+    "noise.fake_velocity": _positive(
+        2.0, "m/s", "Fake velocity of ahrs, 1 sigma at 5 Hz. Lower trusts gravity more, and accelerations less."
+    ),
     "gate.gnss": _positive(5.0, "sigma", "Innovation gate of GNSS position and velocity, joint over the components."),
     "gate.barometer": _positive(5.0, "sigma", "Innovation gate of the barometer."),
     "gate.magnetometer": _positive(3.0, "sigma", "Innovation gate of the magnetometer."),
@@ -90,10 +92,13 @@ KEYS: dict[str, Key] = {
     "delay.magnetometer": _delay("The same for the magnetometer."),
     "aid.gnss": _switch("on", "Use GNSS position and velocity."),
     "aid.barometer": _switch("on", "Use the barometer."),
-    "aid.magnetometer": _switch("heading", "Use the magnetometer: as a heading that leaves tilt alone, or as three axes.", ("off", "heading", "3-axis")),
+    "aid.magnetometer": _switch(
+        "heading", "Use the magnetometer: as a heading that leaves tilt alone, or as three axes.", ("off", "heading", "3-axis")
+    ),
     "aid.zero_velocity": _switch("on", "Zero velocity at rest."),
     "aid.zero_rate": _switch("on", "Zero rate at rest."),
     "aid.fake_position": _switch("on", "Fake position while nothing else holds it."),
+    "aid.yaw_bank": _switch("on", "Set yaw from GNSS velocity where it is unknown, or contradicted by it."),
     "aid.fake_velocity": _switch("off", "Fake zero velocity, always on in ahrs."),
     "timeout.gnss": _positive(7.0, "s", "After this long without a fix that passes, GNSS is let in again by force, at the gate's edge."),
     "timeout.barometer": _positive(7.0, "s", "The same for the barometer."),
@@ -123,7 +128,9 @@ KEYS: dict[str, Key] = {
     "rest.accel": _positive(0.3, "m/s^2", "At rest the standard deviation of |f| over a second is below this."),
     "rest.gravity": _positive(0.5, "m/s^2", "At rest mean |f| differs from gravity by less than this."),
     "imu.kind": _switch("instant", "An IMU sample is the value at its time, or the mean since the sample before.", ("instant", "mean")),
-    "baro.temperature": Key(math.nan, "K", "Air temperature at the ground, scales pressure altitude. Default: standard atmosphere.", low=200.0, high=330.0),
+    "baro.temperature": Key(
+        math.nan, "K", "Air temperature at the ground, scales pressure altitude. Default: standard atmosphere.", low=200.0, high=330.0
+    ),
     "baro.offset": _switch("on", "Estimate the barometer offset as a state."),
 }
 
@@ -190,7 +197,9 @@ def _check(key: str, value: Any, where: str) -> Value:
     spec = KEYS.get(key)
     if spec is None:
         near = difflib.get_close_matches(key, [*KEYS, *GROUPS], 1)
-        raise UsageError("a configuration key", repr(key), where, f"did you mean {near[0]!r}?" if near else "see the documentation's table of keys")
+        raise UsageError(
+            "a configuration key", repr(key), where, f"did you mean {near[0]!r}?" if near else "see the documentation's table of keys"
+        )
     if spec.words:
         word = {True: "on", False: "off"}.get(value, str(value)) if isinstance(value, bool) else str(value)
         if word not in spec.words:

@@ -89,7 +89,7 @@ def _check_imu(flight: FlightLog, out: Checked, upright: bool) -> None:
         raise HaltereError("columns gyro_x..z and accel_x..z", f"no {', '.join(missing)}", where)
     imu = _clean_time(out, "imu", imu)
     values = np.column_stack([imu.vector("gyro"), imu.vector("accel")]) if len(imu) else np.empty((0, 6))
-    imu = out.drop("imu", imu, np.isfinite(values).all(axis=1), "not finite")
+    imu = out.drop("imu", imu, np.asarray(np.isfinite(values).all(axis=1)), "not finite")
     if len(imu) < 20:
         raise HaltereError("at least 20 usable samples", f"{len(imu)}", where, "see haltere info for what was left out")
     rate = imu.rate
@@ -100,11 +100,17 @@ def _check_imu(flight: FlightLog, out: Checked, upright: bool) -> None:
         )  # fmt: skip
     if rate < RATE_POOR:
         out.warnings.append(f"imu: {rate:.0f} Hz is slow for a strapdown filter; turns and vibration between samples are lost")
+    gaps = np.diff(imu.t)
+    if gaps.max() > 2.0:
+        n_long, longest = int(np.count_nonzero(gaps > 2.0)), float(gaps.max())
+        out.warnings.append(f"imu: {n_long} gap{'s' * (n_long > 1)} longer than 2 s, the longest {longest:.0f} s; nothing is known of them")
     f = np.linalg.norm(imu.vector("accel"), axis=1)
     w = np.linalg.norm(imu.vector("gyro"), axis=1)
     f_mid, w_mid = float(np.median(f)), float(np.median(w))
     if 0.7 < f_mid < 1.4:
-        raise HaltereError("specific force near 9.81 m/s^2", f"median {f_mid:.2f}", where, "it looks like g: give the unit in the column map")
+        raise HaltereError(
+            "specific force near 9.81 m/s^2", f"median {f_mid:.2f}", where, "it looks like g: give the unit in the column map"
+        )
     if not 3.0 < f_mid < 40.0:
         raise HaltereError("specific force near 9.81 m/s^2", f"median {f_mid:.3g}", where, "check unit and columns of the accelerometer")
     if w_mid > 15.0:
@@ -120,7 +126,7 @@ def _check_imu(flight: FlightLog, out: Checked, upright: bool) -> None:
 
 def _check_magnetometer(out: Checked, stream: Stream) -> Stream:
     m = stream.vector("mag")
-    stream = out.drop("magnetometer", stream, np.isfinite(m).all(axis=1), "not finite")
+    stream = out.drop("magnetometer", stream, np.asarray(np.isfinite(m).all(axis=1)), "not finite")
     strength = np.linalg.norm(stream.vector("mag"), axis=1)
     stream = out.drop("magnetometer", stream, strength > 0.0, "zero")
     if len(stream) == 0:
@@ -135,16 +141,13 @@ def _check_magnetometer(out: Checked, stream: Stream) -> Stream:
 
 
 def _check_gnss(out: Checked, stream: Stream) -> Stream:
-    fix = stream.get("fix_type")
+    stream = out.drop("gnss", stream, ~(stream.get("fix_type") < 3.0), "no 3-D fix")
     lat, lon = stream.get("lat"), stream.get("lon")
-    has_velocity = np.isfinite(stream.get("vel_n"))
-    stream = out.drop("gnss", stream, ~(fix < 3.0), "no 3-D fix")
-    lat, lon, has_velocity = stream.get("lat"), stream.get("lon"), np.isfinite(stream.get("vel_n"))
     stream = out.drop("gnss", stream, ~((lat == 0.0) & (lon == 0.0)), "latitude and longitude zero")
-    lat, lon, has_velocity = stream.get("lat"), stream.get("lon"), np.isfinite(stream.get("vel_n"))
+    lat, lon = stream.get("lat"), stream.get("lon")
     stream = out.drop("gnss", stream, ~((np.abs(lat) > 90.0) | (np.abs(lon) > 360.0)), "latitude or longitude impossible")
-    lat, has_velocity = stream.get("lat"), np.isfinite(stream.get("vel_n"))
-    stream = out.drop("gnss", stream, np.isfinite(lat) | has_velocity, "not finite")
+    known = np.isfinite(stream.get("lat")) | np.isfinite(stream.get("vel_n"))
+    stream = out.drop("gnss", stream, known, "not finite")
     return out.drop("gnss", stream, ~(stream.get("h_acc") > 50.0), "accuracy worse than 50 m")
 
 

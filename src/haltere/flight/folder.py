@@ -353,7 +353,8 @@ def _read_table(path: Path, text: list[str]) -> Stream:
             # As text first: an empty or all-NaN column must not change its type by what stands in it.
             table = pl.read_csv(path, infer_schema_length=0)
     except (pl.exceptions.PolarsError, OSError) as error:
-        raise HaltereError(f"a {path.suffix[1:]} table", str(error).splitlines()[0], str(path), "write the table again") from error
+        found = f"one that cannot be read ({str(error).splitlines()[0]})"
+        raise HaltereError(f"a {path.suffix[1:]} table", found, str(path), "write the table again") from error
     columns: dict[str, NDArray[Any]] = {}
     for series in table.get_columns():
         name = series.name if series.name in text else series.name.strip()

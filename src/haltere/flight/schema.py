@@ -74,7 +74,11 @@ STREAMS: dict[str, StreamSchema] = {
         StreamSchema(
             "imu",
             "angular rate and specific force, as the autopilot navigated with",
-            (T, *_xyz("gyro", "rad/s", "FRD", "angular rate"), *_xyz("accel", "m/s^2", "FRD", "specific force (at rest, level: z = -9.81)")),
+            (
+                T,
+                *_xyz("gyro", "rad/s", "FRD", "angular rate"),
+                *_xyz("accel", "m/s^2", "FRD", "specific force (at rest, level: z = -9.81)"),
+            ),
             ("t", "gyro_x", "gyro_y", "gyro_z", "accel_x", "accel_y", "accel_z"),
         ),
         StreamSchema(

@@ -14,7 +14,7 @@ def multiply(a: FloatArray, b: FloatArray) -> FloatArray:
     """Hamilton product of quaternions, (n, 4) or (4,)."""
     a0, a1, a2, a3 = np.moveaxis(np.asarray(a), -1, 0)
     b0, b1, b2, b3 = np.moveaxis(np.asarray(b), -1, 0)
-    return np.stack(
+    product: FloatArray = np.stack(
         [
             a0 * b0 - a1 * b1 - a2 * b2 - a3 * b3,
             a0 * b1 + a1 * b0 + a2 * b3 - a3 * b2,
@@ -23,6 +23,7 @@ def multiply(a: FloatArray, b: FloatArray) -> FloatArray:
         ],
         axis=-1,
     )
+    return product
 
 
 def conjugate(q: FloatArray) -> FloatArray:

@@ -82,10 +82,10 @@ def nees_series(solution: Solution, truth: Stream) -> dict[str, tuple[FloatArray
             errors[block] = np.column_stack([np.interp(t, truth.t[good], reference[good, k]) for k in range(3)]) - estimate
     if "pos_n" in solution:
         tp, p = reference_position(truth, solution.summary.get("origin"))
-        good = np.isfinite(p).all(axis=1)
-        if np.count_nonzero(good) > 1:
+        known = np.isfinite(p)
+        if all(np.count_nonzero(known[:, k]) > 1 for k in range(3)):
             estimate = solution.vector("pos", "ned")[row]
-            errors["position"] = np.column_stack([np.interp(t, tp[good], p[good, k]) for k in range(3)]) - estimate
+            errors["position"] = np.column_stack([np.interp(t, tp[known[:, k]], p[known[:, k], k]) for k in range(3)]) - estimate
     if "baro_bias" in solution and "baro_bias" in truth and np.isfinite(truth["baro_bias"]).sum() > 1:
         good = np.isfinite(truth["baro_bias"])
         errors["baro_bias"] = (np.interp(t, truth.t[good], truth["baro_bias"][good]) - solution["baro_bias"][row])[:, None]

@@ -25,7 +25,8 @@ def _inside(solution: Solution, t: FloatArray, gap: float = 0.5) -> NDArray[np.b
         return np.zeros(len(t), bool)
     i = np.clip(np.searchsorted(solution.t, t, side="right") - 1, 0, len(solution) - 2)
     inside = (t >= solution.t[0]) & (t <= solution.t[-1])
-    return inside & (solution.t[i + 1] - solution.t[i] <= gap)
+    inside &= solution.t[i + 1] - solution.t[i] <= gap
+    return np.asarray(inside)
 
 
 def attitude_error(solution: Solution, reference: Stream) -> tuple[FloatArray, FloatArray, FloatArray]:
@@ -52,13 +53,18 @@ def attitude_error(solution: Solution, reference: Stream) -> tuple[FloatArray, F
 
 
 def reference_position(reference: Stream, origin: list[float] | None) -> tuple[FloatArray, FloatArray]:
-    """Times and positions NED (m, 3) [m] of a reference from our origin: from lat, lon, alt where given, else as given."""
-    if origin is not None and "lat" in reference and "lon" in reference:
-        alt = reference.get("alt")
-        good = np.isfinite(reference["lat"]) & np.isfinite(reference["lon"])
-        n, e, d = local_from_geodetic(reference["lat"][good], reference["lon"][good], alt[good], *origin)
-        return reference.t[good], np.column_stack([n, e, d])
+    """Times (m,) and positions NED (m, 3) [m] of a reference from our origin, NaN where not known.
+
+    From lat, lon and alt where they are given, since they hang on no origin; else from pos_n, pos_e, pos_d, which are
+    relative to the flight's home.
+    """
     p = reference.vector("pos", "ned")
+    if origin is not None:
+        n, e, d = local_from_geodetic(reference.get("lat"), reference.get("lon"), reference.get("alt"), *origin)
+        geodetic = np.column_stack([n, e, d])
+        for axes in ([0, 1], [2]):  # a column comes from one source alone: two would differ by a step
+            if np.isfinite(geodetic[:, axes]).any():
+                p[:, axes] = geodetic[:, axes]
     good = np.isfinite(p).any(axis=1)
     return reference.t[good], p[good]
 

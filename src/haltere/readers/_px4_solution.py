@@ -2,14 +2,10 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 import numpy as np
 
 from haltere.readers._common import Builder, Columns, FloatArray, IntArray, merge_rows, metres_per_degree
-
-if TYPE_CHECKING:
-    from haltere.readers.px4 import Log, Topic
+from haltere.readers._ulog import Log, Topic
 
 __all__ = ["add_solution", "add_truth", "set_home"]
 

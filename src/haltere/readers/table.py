@@ -67,7 +67,13 @@ def sniff(path: Path, head: bytes) -> bool:
         return False
     mark = _delimiter(lines[0])
     fields = lines[0].split(mark)
-    return len(fields) > 1 and all(WORD.match(f) for f in fields) and (len(lines) < 2 or len(lines[1].split(mark)) == len(fields))
+    named = [bool(WORD.match(f)) for f in fields]
+    # A nameless column is the row number that some tools write.
+    return (
+        sum(named) > 1
+        and all(n or not f.strip(' "') for n, f in zip(named, fields, strict=True))
+        and (len(lines) < 2 or len(lines[1].split(mark)) == len(fields))
+    )
 
 
 def read(path: Path, column_map: Mapping[str, str] | None = None) -> FlightLog:
@@ -152,7 +158,7 @@ def _load(path: Path) -> pl.DataFrame:
         table = pl.read_csv(path, separator=mark, infer_schema_length=0, comment_prefix="#")
         return table.rename({name: name.strip() for name in table.columns})
     except (pl.exceptions.PolarsError, OSError) as error:
-        raise unusable(path, "a CSV or Parquet table", str(error).splitlines()[0]) from error
+        raise unusable(path, "a CSV or Parquet table", f"one that cannot be read ({str(error).splitlines()[0]})") from error
 
 
 def _split_unit(text: str) -> tuple[str, str]:

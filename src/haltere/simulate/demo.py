@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 
 import numpy as np
+from numpy.typing import NDArray
 
 from haltere.core.earth import gravity
 from haltere.errors import UsageError
@@ -23,7 +24,12 @@ NOISE_MAGNETOMETER, NOISE_BARO, H_ACC, V_ACC, S_ACC = 1.0, 0.5, 0.8, 1.2, 0.15
 
 
 def demo_flight(
-    seed: int = 1, duration: float = 120.0, *, imu_rate: float = 250.0, rest: float = 4.0, gyro_bias_sd: float | None = None,
+    seed: int = 1,
+    duration: float = 120.0,
+    *,
+    imu_rate: float = 250.0,
+    rest: float = 4.0,
+    gyro_bias_sd: float | None = None,
     accel_bias_sd: float | None = None,
 ) -> FlightLog:
     """Simulate a flight along a random smooth path, with truth.
@@ -57,14 +63,14 @@ def demo_flight(
     noise = {k: float(v) for k, v in defaults().items() if k.startswith("noise.")}
     g = gravity(HOME.lat, HOME.alt)
     dt = 1.0 / imu_rate
-    t = dt * np.arange(int(duration * imu_rate))
+    t = dt * np.arange(int(duration * imu_rate), dtype=np.float64)
     motion = fly(t, *random_path(rng, duration + 10.0, rest), g)
     n = len(t)
 
-    def white(sd: float, shape: tuple[int, int]) -> np.ndarray[tuple[int, ...], np.dtype[np.float64]]:
+    def white(sd: float, shape: tuple[int, int]) -> NDArray[np.float64]:
         return sd * rng.standard_normal(shape)
 
-    def walk(start_sd: float, density: float, step: float, m: int) -> np.ndarray[tuple[int, ...], np.dtype[np.float64]]:
+    def walk(start_sd: float, density: float, step: float, m: int) -> NDArray[np.float64]:
         return white(start_sd, (1, 3)) + np.cumsum(white(density * math.sqrt(step), (m, 3)), axis=0)
 
     gyro_bias = walk(0.005 if gyro_bias_sd is None else gyro_bias_sd, noise["noise.gyro_bias"], dt, n)
@@ -73,7 +79,8 @@ def demo_flight(
     gyro = motion.gyro_b + gyro_bias + shake * white(noise["noise.gyro"] / math.sqrt(dt), (n, 3))
     accel = motion.accel_b + accel_bias + shake * white(noise["noise.accel"] / math.sqrt(dt), (n, 3))
 
-    lat, lon, alt = geodetic_from_local(*motion.pos_n.T, HOME.lat, HOME.lon, HOME.alt)
+    pos = motion.pos_n
+    lat, lon, alt = geodetic_from_local(pos[:, 0], pos[:, 1], pos[:, 2], HOME.lat, HOME.lon, HOME.alt)
     every = {name: slice(max(1, round(imu_rate / rate)), None, max(1, round(imu_rate / rate)))
              for name, rate in (("mag", 50.0), ("baro", 25.0), ("gnss", 10.0))}  # fmt: skip
 
@@ -82,7 +89,7 @@ def demo_flight(
     d, i = field.declination, field.dip
     m_n = field.strength * np.array([math.cos(i) * math.cos(d), math.cos(i) * math.sin(d), math.sin(i)])
     mag = _to_body(motion.q_nb[s], m_n)
-    mag += white(NOISE_MAGNETOMETER, mag.shape)  # type: ignore[arg-type]
+    mag = mag + white(NOISE_MAGNETOMETER, (len(mag), 3))
 
     s = every["baro"]
     m = len(t[s])
@@ -95,14 +102,16 @@ def demo_flight(
     m = len(t[s])
     fix = motion.pos_n[s] + white(1.0, (m, 3)) * np.array([H_ACC, H_ACC, V_ACC])
     vel = motion.vel_n[s] + white(S_ACC, (m, 3))
-    fix_lat, fix_lon, fix_alt = geodetic_from_local(*fix.T, HOME.lat, HOME.lon, HOME.alt)
+    fix_lat, fix_lon, fix_alt = geodetic_from_local(fix[:, 0], fix[:, 1], fix[:, 2], HOME.lat, HOME.lon, HOME.alt)
 
     ones = np.ones(m)
     truth = {"t": t} | {f"q_{a}": motion.q_nb[:, k] for k, a in enumerate("wxyz")}
     truth |= {f"vel_{a}": motion.vel_n[:, k] for k, a in enumerate("ned")} | {f"pos_{a}": motion.pos_n[:, k] for k, a in enumerate("ned")}
     truth["baro_bias"] = np.interp(t, t_baro, offset)
     truth |= {"lat": lat, "lon": lon, "alt": alt}
-    truth |= {f"gyro_bias_{a}": gyro_bias[:, k] for k, a in enumerate("xyz")} | {f"accel_bias_{a}": accel_bias[:, k] for k, a in enumerate("xyz")}
+    truth |= {f"gyro_bias_{a}": gyro_bias[:, k] for k, a in enumerate("xyz")} | {
+        f"accel_bias_{a}": accel_bias[:, k] for k, a in enumerate("xyz")
+    }
     return FlightLog(
         {
             "imu": {"t": t} | {f"gyro_{a}": gyro[:, k] for k, a in enumerate("xyz")} | {f"accel_{a}": accel[:, k] for k, a in enumerate("xyz")},
@@ -122,7 +131,7 @@ def demo_flight(
     )  # fmt: skip
 
 
-def _to_body(q: np.ndarray, v_n: np.ndarray) -> np.ndarray:  # type: ignore[type-arg]
+def _to_body(q: NDArray[np.float64], v_n: NDArray[np.float64]) -> NDArray[np.float64]:
     """A constant NED vector seen from the body at each attitude, (n, 3)."""
     w, u = q[:, :1], q[:, 1:]
     c = np.cross(u, v_n)

@@ -59,9 +59,9 @@ def random_path(rng: np.random.Generator, duration: float, rest: float, extent: 
     """
     spacing = 5.0
     n = max(9, int((duration - rest) / spacing) + 1)
-    moving = rest + spacing * np.arange(n)
+    moving = rest + spacing * np.arange(n, dtype=np.float64)
     pos = np.column_stack([rng.uniform(-extent, extent, n), rng.uniform(-extent, extent, n), rng.uniform(-30.0, -10.0, n)])
-    yaw = np.cumsum(rng.uniform(-1.2, 1.2, n))
+    yaw = np.asarray(np.cumsum(rng.uniform(-1.2, 1.2, n)), dtype=np.float64)
     if rest > 0.0:
         pos = pos * np.minimum(1.0, np.arange(n) / 3.0)[:, None]  # take off before going anywhere
     return moving, pos, yaw

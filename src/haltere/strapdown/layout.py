@@ -11,12 +11,30 @@ from functools import cache
 
 import numpy as np
 
-__all__ = ["ALIGNMENT", "AID_STATE", "BA", "BG", "CORE", "EVENT", "IMU_SAMPLE", "LAST", "MEASUREMENT", "PARAMETERS", "POS", "REST", "THETA", "VEL", "layout"]
+from haltere._jit import constant
 
-#: First column of each core block. NumPy integers, since a plain one would compile a version of every function it is passed to.
-THETA, VEL, POS, BG, BA = (np.int64(i) for i in (0, 3, 6, 9, 12))
+__all__ = [
+    "AID_STATE",
+    "ALIGNMENT",
+    "BA",
+    "BG",
+    "CORE",
+    "EVENT",
+    "IMU_SAMPLE",
+    "LAST",
+    "MEASUREMENT",
+    "PARAMETERS",
+    "POS",
+    "REST",
+    "THETA",
+    "VEL",
+    "layout",
+]
+
+#: First column of each core block.
+THETA, VEL, POS, BG, BA = (constant(i) for i in (0, 3, 6, 9, 12))
 #: Block that ends in column 15, the first one after the core: a single state there is ``(LAST, (0, 0, h))``.
-LAST = np.int64(13)
+LAST = constant(13)
 #: Number of core error states.
 CORE = 15
 
@@ -28,7 +46,7 @@ EVENT_CAPACITY = 32
 
 def _record(*fields: tuple[object, ...]) -> np.dtype[np.void]:
     """Nested record type that plain Python can also reach by attribute."""
-    return np.dtype((np.record, list(fields)), align=True)  # type: ignore[call-overload,no-any-return]
+    return np.dtype((np.record, list(fields)), align=True)
 
 
 IMU_SAMPLE = _record(("t", "f8"), ("w", "f8", 3), ("f", "f8", 3))
@@ -88,6 +106,20 @@ ALIGNMENT = _record(
     ("kind", "i8"),
 )
 
+#: Bank of yaw hypotheses: states [v_N, v_E, yaw error], covariances, weights, and the velocity increment since the last fix.
+YAW_BANK = _record(
+    ("x", "f8", (5, 3)),
+    ("P", "f8", (5, 3, 3)),
+    ("w", "f8", 5),
+    ("dv", "f8", 2),
+    ("slow", "f8", 2),
+    ("z", "f8", 2),  # the fix that waits for the bank, and its variance
+    ("r", "f8"),
+    ("fresh", "i8"),
+    ("t", "f8"),
+    ("n", "i8"),
+)
+
 EVENT = _record(("t", "f8"), ("code", "i8"), ("sensor", "i8"), ("value", "f8"))
 
 #: Every number a filter is told. Field ``noise_gyro`` is configuration key ``noise.gyro``.
@@ -101,7 +133,7 @@ PARAMETERS = np.dtype(
             "noise_zero_velocity noise_zero_rate noise_fake_position noise_fake_position_rest noise_fake_velocity "
             "gate_gnss gate_barometer gate_magnetometer gate_zero_velocity gate_zero_rate "
             "delay_gnss_velocity delay_gnss_position delay_barometer delay_magnetometer "
-            "aid_gnss aid_barometer aid_magnetometer aid_zero_velocity aid_zero_rate aid_fake_position aid_fake_velocity "
+            "aid_gnss aid_barometer aid_magnetometer aid_zero_velocity aid_zero_rate aid_fake_position aid_fake_velocity aid_yaw_bank "
             "timeout_gnss timeout_barometer timeout_magnetometer timeout_imu "
             "arm_gnss_x arm_gnss_y arm_gnss_z "
             "field_declination field_dip field_strength field_tolerance_strength field_tolerance_dip "
@@ -147,6 +179,7 @@ def layout(baro: int = 0) -> np.dtype[np.void]:
             ("w_raw", "f8", 3),
             ("f_raw", "f8", 3),
             ("anchor", "f8", 3),  # last position that something held
+            ("yaw_corrected", "f8"),  # sum of the turns about the vertical that corrections made [rad]
             ("gravity", "f8"),
             ("origin", "f8", 3),
             ("has_origin", "i8"),
@@ -171,6 +204,7 @@ def layout(baro: int = 0) -> np.dtype[np.void]:
             ("event", EVENT, (EVENT_CAPACITY,)),
             ("aid", AID_STATE, (8,)),
             ("rest", REST),
+            ("yaw", YAW_BANK),
             ("align", ALIGNMENT),
             ("imu_head", "i8"),
             ("imu_n", "i8"),

@@ -8,7 +8,7 @@ from __future__ import annotations
 from typing import Any
 
 from haltere._jit import jit
-from haltere.core.rotation import Mat, Vec, cross, dcm, mat_vec, quat_from_rotvec, quat_mul, quat_unit, rotvec_dcm
+from haltere.core.rotation import Mat, Vec, cross, dcm, dot, mat_vec, quat_from_rotvec, quat_mul, quat_unit, rotvec_dcm
 
 __all__ = ["inject", "left_F", "mechanise", "predict", "transpose"]
 
@@ -151,7 +151,9 @@ def inject(s: Any) -> None:
     dx, P = s.dx, s.P
     n = s.P.shape[0]
     t = (dx[0], dx[1], dx[2])
-    q = quat_unit(quat_mul((s.q[0], s.q[1], s.q[2], s.q[3]), quat_from_rotvec(t)))
+    before = (s.q[0], s.q[1], s.q[2], s.q[3])
+    s.yaw_corrected += dot(dcm(before)[2], t)
+    q = quat_unit(quat_mul(before, quat_from_rotvec(t)))
     s.q[0], s.q[1], s.q[2], s.q[3] = q
     for i in range(3):
         s.v[i] += dx[3 + i]

@@ -1,0 +1,166 @@
+"""Track from above and the timeline of what was used, refused and happened. It computes no results."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from haltere.metrics.errors import reference_position
+from haltere.report.context import Context, Section, covered, sensor_label
+from haltere.report.panels import FOOT, plain
+from haltere.report.series import display, thin
+from haltere.report.style import AXES, SENSOR_COLOURS
+
+__all__ = ["timeline", "track"]
+
+FloatArray = NDArray[np.float64]
+#: Fixes drawn as dots on the map at most.
+DOTS = 1200
+
+
+def track(c: Context) -> Section:
+    """The flight from above in metres, north up."""
+    section = Section("map", "Map")
+    if "pos_n" not in c.solution:
+        section.note = f"Not drawn: {c.solution.config.estimator} estimates attitude only, and no position."
+        return section
+    if not c.held_by_measurement:
+        section.note = "Not drawn: no GNSS position was let in, so where the vehicle flew is not known."
+        return section
+    traces: list[dict[str, Any]] = []
+    points: list[tuple[FloatArray, FloatArray]] = []
+
+    def add(label: str, colour: str, t: FloatArray, p: FloatArray, dots: bool) -> None:
+        good = np.isfinite(p[:, :2]).all(axis=1)
+        if not good.any():
+            return
+        t, p = t[good], p[good]
+        if dots:
+            rows = thin([p[:, 0], p[:, 1]], DOTS)
+            shown = [t[rows], p[rows, 0], p[rows, 1], p[rows, 2]]
+        else:
+            shown = display(t, [p[:, 0], p[:, 1], p[:, 2]], 2 * c.pool.points)
+        ids = [c.pool.add(shown[0], 1e-4), *(c.pool.add(s) for s in shown[1:])]
+        points.append((p[:, 0], p[:, 1]))
+        look = {"marker": {"size": 4, "color": f"@{colour}"}} if dots else {"line": {"width": 1.8 if colour == "estimate" else 1.2, "color": f"@{colour}"}}
+        traces.append({
+            "type": "scatter", "name": label, "x": {"a": ids[2]}, "y": {"a": ids[1]}, "customdata": {"zip": [ids[0], ids[3]]},
+            "mode": "markers" if dots else "lines", **look,
+            "hovertemplate": "N %{y:.2f} m, E %{x:.2f} m, D %{customdata[1]:.2f} m<br>t = %{customdata[0]:.2f} s",
+        })  # fmt: skip
+
+    components = [c.measured(f"pos_{a}") for a in "ned"]
+    if len(components[0][0]) and len({len(t) for t, _ in components}) == 1:
+        add("GNSS fixes", "gnss", components[0][0], np.column_stack([v for _, v in components]), True)
+    add("estimate", "estimate", c.solution.t, c.solution.vector("pos", "ned"), False)
+    for name, stream in c.references:
+        t, p = reference_position(stream, list(c.origin) if c.origin else None)
+        if len(t):
+            add(name, name, t, p, False)
+    ends = c.solution.vector("pos", "ned")[[0, -1]]
+    traces.append({
+        "type": "scatter", "name": "start and end", "x": ends[:, 1].tolist(), "y": ends[:, 0].tolist(), "mode": "markers+text", "text": ["start", "end"],
+        "textposition": ["top right", "bottom right"], "textfont": {"color": "@text"}, "hoverinfo": "skip",
+        "marker": {"size": 10, "symbol": ["circle-open", "square-open"], "color": "@text", "line": {"width": 2}},
+    })  # fmt: skip
+    _mark_events(c, traces)
+    middle, half = _frame(points)
+    axis = {**AXES, "zeroline": True, "nticks": 8}
+    layout = {
+        "margin": {"l": 62, "r": 12, "t": 6, "b": FOOT}, "hovermode": "closest",
+        "xaxis": {**axis, "title": {"text": "east [m]", "standoff": 4}, "range": [middle[1] - half, middle[1] + half], "constrain": "domain"},
+        "yaxis": {**axis, "title": {"text": "north [m]", "standoff": 6}, "range": [middle[0] - half, middle[0] + half], "scaleanchor": "x",
+                  "constrain": "domain"},
+    }  # fmt: skip
+    section.figures.append({"name": "map", "traces": traces, "layout": layout, "height": 440, "time": False})
+    return section
+
+
+def _frame(points: list[tuple[FloatArray, FloatArray]]) -> tuple[tuple[float, float], float]:
+    """Middle (north, east) and half the side of a square that holds all points."""
+    north, east = (np.concatenate([p[k] for p in points]) for k in (0, 1))
+    middle = (0.5 * float(north.min() + north.max()), 0.5 * float(east.min() + east.max()))
+    half = 0.5 * max(float(np.ptp(north)), float(np.ptp(east)), 2.0)
+    return middle, 1.08 * half
+
+
+def _mark_events(c: Context, traces: list[dict[str, Any]]) -> None:
+    """Where the vehicle was when something happened."""
+    times = np.array([t for t in c.event_times if c.solution.t[0] <= t <= c.solution.t[-1]])
+    if len(times) == 0:
+        return
+    north, east = (np.interp(times, c.solution.t, c.solution[f"pos_{a}"]) for a in "ne")
+    words = {round(float(e["t_onset"] or 0.0), 6): f"{sensor_label(e['sensor'])}: {e['kind']}" for e in c.solution.events}
+    traces.append({
+        "type": "scatter", "name": "event", "x": east.tolist(), "y": north.tolist(), "mode": "markers",
+        "text": [plain(words.get(round(float(t), 6), "event")) for t in times], "customdata": times.tolist(),
+        "marker": {"symbol": "star", "size": 10, "color": "@event"}, "hovertemplate": "%{text}<br>t = %{customdata:.2f} s",
+    })  # fmt: skip
+
+
+def timeline(c: Context) -> Section:
+    """When each sensor was used, when refused, and what happened."""
+    aids = c.solution.aids
+    rows: list[tuple[str, str, FloatArray]] = []
+    if "imu" in c.flight:
+        rows.append(("IMU", "imu", c.flight["imu"].t))
+    for sensor in dict.fromkeys(["gnss", "magnetometer", "barometer", *aids["sensor"].tolist()]):
+        mine = aids["sensor"] == sensor
+        if mine.any():
+            used = mine & (aids["status"] != "rejected")
+            rows.append((sensor_label(sensor), SENSOR_COLOURS.get(sensor, "assumed"), np.unique(aids["t"][used])))
+    labels = [r[0] for r in rows]
+    traces: list[dict[str, Any]] = []
+    for k, (label, colour, t) in enumerate(rows):
+        starts, ends = covered(t)
+        if len(starts) > 600:  # a stream of nothing but holes: one bar says as much
+            starts, ends = starts[:1], ends[-1:]
+        text = [f"{plain(label)}: {a:.2f} to {b:.2f} s" for a, b in zip(starts, ends, strict=True)]
+        traces.append(_bars(c, k, starts, ends, f"@{colour}", text, "used", 12, False))
+    named: set[str] = set()
+    for status, colour, word in (("deweighted", "deweighted", "de-weighted"), ("rejected", "refused", "refused")):
+        for label in labels:
+            mine = [e for e in c.episodes if e.status == status and sensor_label(e.sensor) == label][:400]
+            if mine:
+                text = [f"{plain(label)} {e.what} {word} {e.n} times, {e.start:.2f} to {e.end:.2f} s{_why(e.reasons)}" for e in mine]
+                starts, ends = np.array([e.start for e in mine]), np.array([e.end for e in mine])
+                traces.append(_bars(c, labels.index(label), starts, ends, f"@{colour}", text, word, 7, word not in named))
+                named.add(word)
+    happened = [e for e in c.solution.events if e.get("t_onset") is not None]
+    if happened:
+        labels.append("events")
+        traces.append({
+            "type": "scatter", "name": "event", "mode": "markers", "x": [float(e["t_onset"]) for e in happened], "y": [len(labels) - 1] * len(happened),
+            "marker": {"symbol": "star", "size": 11, "color": "@event"}, "hovertemplate": "t = %{x:.2f} s: %{text}", "showlegend": False,
+            "text": [plain(f"{sensor_label(e['sensor'])}: {e['kind']}. {e.get('evidence') or ''}") for e in happened],
+        })  # fmt: skip
+    n = len(labels)
+    height = 26 * n + 16 + FOOT
+    layout = {
+        "margin": {"l": 62, "r": 12, "t": 6, "b": FOOT}, "hovermode": "closest",
+        "xaxis": {**AXES, "range": list(c.span), "title": {"text": "t [s]", "standoff": 4}, "hoverformat": ".3f"},
+        "yaxis": {**AXES, "range": [n - 0.4, -0.6], "tickvals": list(range(n)), "ticktext": [plain(x) for x in labels], "showgrid": False,
+                  "automargin": True, "fixedrange": True, "ticks": ""},
+    }  # fmt: skip
+    note = "When measurements were used (thick) and refused or de-weighted (inside); stars are events."
+    return Section("timeline", "Timeline", note, [{"name": "timeline", "traces": traces, "layout": layout, "height": height, "time": True}])
+
+
+def _why(reasons: tuple[str, ...]) -> str:
+    return f" ({', '.join(reasons)})" if reasons else ""
+
+
+def _bars(c: Context, row: int, starts: FloatArray, ends: FloatArray, colour: str, text: list[str], label: str, width: int, legend: bool) -> dict[str, Any]:
+    """Horizontal bars in one trace; the shortest are wide enough to be seen."""
+    least = 0.002 * (c.span[1] - c.span[0])
+    x: list[float | None] = []
+    texts: list[str | None] = []
+    for a, b, words in zip(starts.tolist(), ends.tolist(), text, strict=True):
+        x += [round(a, 4), round(max(b, a + least), 4), None]
+        texts += [words, words, None]
+    return {
+        "type": "scatter", "name": label, "legendgroup": label, "showlegend": legend, "mode": "lines", "x": x, "y": [row] * len(x), "text": texts,
+        "line": {"color": colour, "width": width}, "hovertemplate": "%{text}<extra></extra>",
+    }  # fmt: skip

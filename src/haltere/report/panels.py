@@ -1,0 +1,172 @@
+"""Panels over time, one above the other with one time axis, as plotly dictionaries. It knows no sensor and no estimator."""
+
+from __future__ import annotations
+
+import html
+import math
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from haltere.report.series import Pool, display
+from haltere.report.style import AXES
+
+__all__ = ["Figure", "Panels", "plain"]
+
+FloatArray = NDArray[np.float64]
+Figure = dict[str, Any]
+
+#: Pixels of one panel, between panels, and for the time axis; markers shown at most a series.
+ROW, GAP, FOOT, MARKERS = 150, 14, 44, 300
+
+
+def plain(text: object) -> str:
+    """Text of a log for plotly, which reads some tags in text."""
+    return html.escape(str(text), quote=False)
+
+
+class Panels:
+    """Stacked panels with linked time axes.
+
+    Parameters
+    ----------
+    name
+        Of the figure; also the file name of an exported picture.
+    pool
+        Where the numbers go.
+    span
+        First and last time shown [s].
+    titles
+        Title with unit of each panel's vertical axis.
+    row
+        Height of one panel in pixels.
+    """
+
+    def __init__(self, name: str, pool: Pool, span: tuple[float, float], titles: list[str], row: int = ROW) -> None:
+        self.name, self.pool, self.span, self.titles, self.row = name, pool, span, titles, row
+        self.traces: list[dict[str, Any]] = []
+        self.shapes: list[dict[str, Any]] = []
+        self.extent = [(math.inf, -math.inf) for _ in titles]
+        self.reversed: set[int] = set()
+        self.drawn: set[int] = set()
+        self._named: set[str] = set()
+
+    def _axes(self, row: int) -> dict[str, str]:
+        number = "" if row == 0 else str(row + 1)
+        return {"xaxis": f"x{number}", "yaxis": f"y{number}"}
+
+    def _trace(self, row: int, label: str, legend: bool = True, **rest: Any) -> None:
+        """One trace; the legend names each label once a figure."""
+        first = legend and label not in self._named
+        if first:
+            self._named.add(label)
+        self.traces.append({"type": "scatter", "name": plain(label), "legendgroup": plain(label), "showlegend": first, **self._axes(row), **rest})
+
+    def _widen(self, row: int, low: float, high: float) -> None:
+        if math.isfinite(low) and math.isfinite(high):
+            self.extent[row] = (min(self.extent[row][0], low), max(self.extent[row][1], high))
+
+    def line(
+        self, row: int, label: str, colour: str, t: FloatArray, y: FloatArray, sd: FloatArray | None = None, *, unit: str = "",
+        resolution: float = 1e-3, period: float | None = None, width: float = 1.4, centred: bool = False, sigmas: str = "1σ",
+    ) -> None:
+        """A line, with its band of one standard deviation where ``sd`` is given: about the line, or about zero (``centred``)."""
+        columns = [y] if sd is None else [y, sd]
+        shown = display(t, columns, self.pool.points, period)
+        if len(shown[0]) == 0:
+            return
+        ids = [self.pool.add(shown[0], 1e-4), self.pool.add(shown[1], resolution)]
+        finite = shown[1][np.isfinite(shown[1])]
+        reach = 0.0
+        if sd is not None:
+            ids.append(self.pool.add(shown[2], resolution))
+            known = shown[2][np.isfinite(shown[2])]
+            reach = 1.5 * float(np.median(known)) if len(known) else 0.0
+            band = {"t": ids[0], "y": None if centred else ids[1], "sd": ids[2]}
+            self._trace(row, f"{label} ±{sigmas}" if not centred else f"±{sigmas}", band=band, mode="lines", fill="toself", hoverinfo="skip",
+                        fillcolor=f"@{'limit' if centred else colour}/0.22", line={"width": 0})  # fmt: skip
+        low, high = float(finite.min()), float(finite.max())
+        self._widen(row, *((min(low, -reach), max(high, reach)) if centred else (low - reach, high + reach)))
+        few = len(finite) <= 60
+        trace: dict[str, Any] = {
+            "x": {"a": ids[0]}, "y": {"a": ids[1]}, "mode": "lines+markers" if few else "lines", "line": {"color": f"@{colour}", "width": width},
+            "hovertemplate": f"%{{y:.4~g}}{' ± %{customdata:.2~g}' if sd is not None else ''} {unit}",
+        }  # fmt: skip
+        if few:
+            trace["marker"] = {"size": 4, "color": f"@{colour}"}
+        if sd is not None:
+            trace["customdata"] = {"a": ids[2]}
+        self._trace(row, label, **trace)
+        self.drawn.add(row)
+
+    def limits(self, row: int, label: str, t: FloatArray, bound: FloatArray, *, resolution: float = 1e-3, colour: str = "limit") -> None:
+        """Dotted lines at plus and minus a bound."""
+        shown = display(t, [bound], self.pool.points // 2)
+        if len(shown[0]) == 0:
+            return
+        x, b = self.pool.add(shown[0], 1e-4), self.pool.add(shown[1], resolution)
+        for sign in (1.0, -1.0):
+            self._trace(row, label, x={"a": x}, y={"b": b, "k": sign}, mode="lines", hoverinfo="skip",
+                        line={"color": f"@{colour}", "width": 1, "dash": "dot"})  # fmt: skip
+
+    def markers(
+        self, row: int, label: str, colour: str, t: FloatArray, y: FloatArray, *, symbol: str = "x", size: int = 7, texts: list[str] | None = None,
+        unit: str = "", resolution: float = 1e-3, widen: bool = True,
+    ) -> None:
+        """Marked points, at most `MARKERS` of them with the extremes among them."""
+        from haltere.report.series import thin
+
+        good = np.flatnonzero(np.isfinite(y) & np.isfinite(t))
+        if len(good) == 0:
+            return
+        rows = good[thin([y[good]], MARKERS)]
+        if widen:
+            self._widen(row, float(y[rows].min()), float(y[rows].max()))
+        trace: dict[str, Any] = {
+            "x": {"a": self.pool.add(t[rows], 1e-4)}, "y": {"a": self.pool.add(y[rows], resolution)}, "mode": "markers",
+            "marker": {"symbol": symbol, "size": size, "color": f"@{colour}"}, "hovertemplate": f"%{{y:.4~g}} {unit}",
+        }  # fmt: skip
+        if texts is not None:
+            trace["text"] = [plain(texts[i]) for i in rows]
+            trace["hovertemplate"] = f"%{{y:.4~g}} {unit}, %{{text}}"
+        self._trace(row, label, **trace)
+        self.drawn.add(row)
+
+    def note_times(self, times: list[float]) -> None:
+        """Vertical lines through all panels."""
+        for t in times:
+            self.shapes.append({"type": "line", "x0": t, "x1": t, "y0": 0, "y1": 1, "xref": "x", "yref": "paper", "layer": "below",
+                                "line": {"color": "@event", "width": 1, "dash": "dot"}})  # fmt: skip
+
+    @property
+    def height(self) -> int:
+        """Pixels of the panels and the time axis, without the legend."""
+        n = len(self.titles)
+        return n * self.row + (n - 1) * GAP + FOOT
+
+    def figure(self) -> Figure:
+        """The figure: name, traces, layout, height and that its x axis is time."""
+        n = len(self.titles)
+        inner = n * self.row + (n - 1) * GAP
+        layout: dict[str, Any] = {"shapes": self.shapes, "margin": {"l": 62, "r": 12, "t": 6, "b": FOOT}}
+        for k, title in enumerate(self.titles):
+            top = 1.0 - k * (self.row + GAP) / inner
+            number = "" if k == 0 else str(k + 1)
+            low, high = self.extent[k]
+            y: dict[str, Any] = {
+                **AXES, "domain": [max(0.0, top - self.row / inner), top], "anchor": f"x{number}", "nticks": 6,
+                "title": {"text": plain(title), "standoff": 6},
+            }  # fmt: skip
+            if low <= high:
+                margin = 0.06 * (high - low) or max(abs(high), 1.0) * 0.1
+                y["range"] = [low - margin, high + margin]
+                if k in self.reversed:
+                    y["range"].reverse()
+            x: dict[str, Any] = {**AXES, "anchor": f"y{number}", "range": list(self.span), "hoverformat": ".3f", "showticklabels": k == n - 1}
+            if k:
+                x["matches"] = "x"
+            if k == n - 1:
+                x["title"] = {"text": "t [s]", "standoff": 4}
+            layout[f"yaxis{number}"], layout[f"xaxis{number}"] = y, x
+        return {"name": self.name, "traces": self.traces, "layout": layout, "height": self.height, "time": True}

@@ -1,0 +1,67 @@
+"""How a report looks: one colour for one thing, for light and dark, and the style sheet. It draws nothing itself."""
+
+from __future__ import annotations
+
+from importlib import resources
+
+__all__ = ["AXES", "COLOURS", "SENSOR_COLOURS", "colours", "style_sheet"]
+
+#: Colour of each thing as (light, dark). Figures name things (``@estimate``, ``@estimate/0.2`` with opacity), never colours.
+COLOURS: dict[str, tuple[str, str]] = {
+    "estimate": ("#1f6fd0", "#6aabff"),
+    "truth": ("#16181c", "#f0f1f3"),
+    "onboard": ("#d0700a", "#ffa14a"),
+    "gnss": ("#23863a", "#57c873"),
+    "barometer": ("#8a3fb0", "#c792ea"),
+    "magnetometer": ("#0b8484", "#45c8c8"),
+    "imu": ("#4a5a78", "#9fb3d9"),
+    "assumed": ("#6f757d", "#a4abb5"),
+    "refused": ("#cf1f2e", "#ff6b74"),
+    "deweighted": ("#b98900", "#f2c43d"),
+    "event": ("#a8137a", "#ff85d0"),
+    "limit": ("#7d848d", "#8d949e"),
+    "good": ("#1d7a34", "#57c873"),
+    "doubtful": ("#946c00", "#f2c43d"),
+    "bad": ("#c01c2b", "#ff6b74"),
+    "text": ("#1b1f24", "#e4e7eb"),
+    "quiet": ("#5b636d", "#a2a9b3"),
+    "page": ("#ffffff", "#14171b"),
+    "panel": ("#f5f6f8", "#1d2126"),
+    "grid": ("#e2e5e9", "#30353c"),
+    "axis": ("#aab0b8", "#565d67"),
+}
+
+#: Colour of a sensor of the aid records; sensors that are assumptions share one.
+SENSOR_COLOURS = {
+    "gnss": "gnss",
+    "barometer": "barometer",
+    "magnetometer": "magnetometer",
+    "imu": "imu",
+}
+
+#: What every axis has.
+AXES = {
+    "gridcolor": "@grid",
+    "zerolinecolor": "@axis",
+    "linecolor": "@axis",
+    "tickcolor": "@axis",
+    "showline": True,
+    "ticks": "outside",
+    "ticklen": 4,
+    "zeroline": False,
+}
+
+
+def colours() -> dict[str, dict[str, str]]:
+    """Colours by theme and name, for the browser."""
+    return {theme: {name: pair[k] for name, pair in COLOURS.items()} for k, theme in enumerate(("light", "dark"))}
+
+
+def style_sheet() -> str:
+    """The style sheet, with every colour as a variable for either theme; paper is always light."""
+    light, dark = ("".join(f"--{name}:{value};" for name, value in theme.items()) for theme in colours().values())
+    return (
+        f":root{{color-scheme:light dark;{light}}}\n"
+        f"@media screen and (prefers-color-scheme:dark){{:root{{{dark}}}}}\n"
+        f"{resources.files(__package__).joinpath('page.css').read_text(encoding='utf-8')}"
+    )

@@ -1,0 +1,214 @@
+"""The verdict in words and the facts of the flight, from the summary and the solution. It judges nothing that the run has not judged."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from haltere.report.context import Context, Episode, sensor_label
+
+__all__ = ["Verdict", "count", "discarded", "facts", "nis_in_words", "number", "verdict"]
+
+#: Share of a stream's samples above which a discard is worth a word in the verdict.
+WORTH_TELLING = 0.01
+
+
+@dataclass
+class Verdict:
+    """One level, one headline, and sentences under it: what happened, how good it is, what to do."""
+
+    level: str
+    headline: str
+    sentences: list[str] = field(default_factory=list)
+
+
+def number(value: float | None, digits: int = 3) -> str:
+    """A number for reading, with a dash where there is none."""
+    if value is None or not math.isfinite(value):
+        return "–"
+    if value != 0.0 and not 1e-4 <= abs(value) < 1e6:
+        return f"{value:.{digits - 1}e}"
+    shown = f"{value:.{digits}g}"
+    return f"{float(shown):.0f}" if "e" in shown else shown
+
+
+def count(n: int, thing: str) -> str:
+    """``1 sample``, ``28 samples``, ``12,345 samples``."""
+    return f"{n:,} {thing}{'' if n == 1 else 's'}"
+
+
+def discarded(summary: dict[str, Any]) -> list[tuple[str, str, int, int]]:
+    """Stream, reason, number and size of the stream, for everything left out."""
+    return [
+        (stream, reason, int(n), int(facts["n"]))
+        for stream, facts in summary.get("streams", {}).items()
+        for reason, n in facts.get("discarded", {}).items()
+        if n
+    ]
+
+
+def verdict(c: Context) -> Verdict:
+    """What a reader wants to know first."""
+    summary, solution = c.solution.summary, c.solution
+    health = summary.get("health", {})
+    levels = {"good": 0, "doubtful": 1, "bad": 2}
+    by_level = {word: [s for s, h in health.items() if h.get("verdict") == word] for word in levels}
+    broken = [e for e in solution.events if e["kind"] == "diverged"]
+    lost = [d for d in discarded(summary) if d[2] > 0.05 * max(d[3], 1) and d[1] != "before alignment"]
+    worst = 2 if by_level["bad"] or broken else 1 if by_level["doubtful"] or lost else 0
+    if broken:
+        headline = f"The filter broke down {count(len(broken), 'time')}: read what follows with that in mind."
+    elif worst:
+        named = [sensor_label(s) for s in (*by_level["bad"], *by_level["doubtful"])]
+        headline = f"Not all data fit: {_list(named)} {'disagree' if len(named) > 1 else 'disagrees'} with the rest." if named else \
+            "The sensors agree, but a good part of the data could not be used."  # fmt: skip
+    elif by_level["good"]:
+        headline = f"The sensors agree with each other: {_list([sensor_label(s) for s in by_level['good']])}."
+    else:
+        headline = "Nothing but the inertial sensors was used, so nothing confirms the solution."
+        worst = 1
+    out = Verdict(("good", "doubtful", "bad")[worst], headline)
+    out.sentences += [_coverage(c), *_health(by_level, health), *_what_happened(c), *_quality(c), *_left_out(summary)]
+    return out
+
+
+def _list(words: list[str]) -> str:
+    return words[0] if len(words) == 1 else f"{', '.join(words[:-1])} and {words[-1]}"
+
+
+def _coverage(c: Context) -> str:
+    how = next((e["evidence"] for e in c.solution.events if e["kind"] == "aligned"), "it began from a given state")
+    t = c.solution.t
+    return (
+        f"{c.solution.config.estimator} ran from t = {t[0]:.2f} s to {t[-1]:.2f} s ({count(len(t), 'row')}): {how}"
+        f"{f' at t = {t[0]:.2f} s' if how.startswith('initial') else ''}."
+    )
+
+
+def _health(by_level: dict[str, list[str]], health: dict[str, Any]) -> list[str]:
+    return [
+        f"{sensor_label(s)[:1].upper()}{sensor_label(s)[1:]} {word}: {health[s].get('why', '')}."
+        for word in ("bad", "doubtful")
+        for s in by_level[word]
+    ]
+
+
+def episode_in_words(e: Episode) -> str:
+    """One stretch of refusals as a sentence without its full stop."""
+    word = "refused" if e.status == "rejected" else "de-weighted"
+    what = sensor_label(e.sensor) if e.what == e.sensor or e.sensor.startswith(("zero", "fake")) else f"{sensor_label(e.sensor)} {e.what}"
+    why = "" if e.reasons in ((), ("innovation",)) else f" ({', '.join(e.reasons)})"
+    if e.n == 1:
+        return f"{what} {word} once at t = {e.start:.1f} s{why}"
+    return f"{what} {word} {e.n} times from t = {e.start:.1f} to {e.end:.1f} s{why}"
+
+
+def _what_happened(c: Context) -> list[str]:
+    out = []
+    noted = [e for e in c.solution.events if e["kind"] not in ("aligned", "reset")]
+    for e in noted[:4]:
+        when = e.get("t_onset") if e.get("t_onset") is not None else e.get("t_detected")
+        at = f"At t = {when:.1f} s" if when is not None else "At some time"
+        out.append(f"{at}: {sensor_label(e['sensor'])} {e['kind']}{', ' + e['evidence'] if e.get('evidence') else ''}.")
+    if len(noted) > 4:
+        out.append(f"{count(len(noted) - 4, 'further event')} in the table below.")
+    sensors = [e for e in c.episodes if not e.sensor.startswith(("zero", "fake"))]
+    largest = sorted(sorted(sensors, key=lambda e: -e.n)[:3], key=lambda e: e.start)
+    for e in largest:
+        words = episode_in_words(e)
+        out.append(f"{words[:1].upper()}{words[1:]}.")
+    if len(sensors) > len(largest):
+        out.append(f"{len(sensors) - len(largest)} smaller stretches of refused measurements are listed below.")
+    i = int(np.argmax(c.tilt))
+    if c.tilt[i] > 60.0:
+        first = int(np.argmax(c.tilt > 60.0))
+        out.append(f"The tilt passed 60° at t = {c.solution.t[first]:.1f} s and reached {c.tilt[i]:.0f}° at t = {c.solution.t[i]:.1f} s.")
+    return out
+
+
+def _quality(c: Context) -> list[str]:
+    out = []
+    for name, rows in c.solution.summary.get("errors", {}).items():
+        parts = []
+        angles = [(k, rows[f"{k}_deg"]["rms"]) for k in ("roll", "pitch", "yaw") if f"{k}_deg" in rows]
+        if angles:
+            parts.append(f"{', '.join(f'{k} {number(v)}°' for k, v in angles)}")
+        for stem, word, unit in (("vel", "velocity", "m/s"), ("pos", "position", "m")):
+            axes = [rows[f"{stem}_{a}"]["rms"] for a in "ned" if f"{stem}_{a}" in rows]
+            if axes:
+                parts.append(f"{word} {' / '.join(number(v) for v in axes)} {unit}{' north / east / down' if len(axes) == 3 and stem == 'vel' else ''}")
+        if parts:
+            what = "RMS error against truth" if name == "truth" else f"RMS difference from the {name} solution, which is another estimate and no truth"
+            out.append(f"{what}: {'; '.join(parts)}.")
+    sd = {k: float(np.median(c.solution[f"sd_{k}"])) for k in ("roll", "pitch", "yaw", "vel_n", "vel_e", "vel_d", "pos_n", "pos_e", "pos_d") if f"sd_{k}" in c.solution}
+    parts = [f"{k} {number(math.degrees(sd[k]), 2)}°" for k in ("roll", "pitch", "yaw") if k in sd]
+    for stem, word, unit in (("vel", "velocity", "m/s"), ("pos", "position", "m")):
+        if f"{stem}_n" in sd:
+            parts.append(f"{word} {' / '.join(number(sd[f'{stem}_{a}'], 2) for a in 'ned')} {unit}")
+    out.append(f"Stated 1σ, median over the flight: {', '.join(parts)}.")
+    return out
+
+
+def _left_out(summary: dict[str, Any]) -> list[str]:
+    lost = discarded(summary)
+    if not lost:
+        return ["No sample was discarded."]
+    large = [d for d in lost if d[2] > WORTH_TELLING * max(d[3], 1)]
+    told = "; ".join(f"{count(n, 'sample')} of {stream} ({reason}, {100.0 * n / max(size, 1):.0f} % of it)" for stream, reason, n, size in large[:4])
+    rest = sum(n for _, _, n, _ in lost) - sum(d[2] for d in large[:4])
+    if not told:
+        return [f"{count(rest, 'sample')} discarded, less than one in a hundred of any stream; the table below says why."]
+    others = f"; and {count(rest, 'other')}" if rest else ""
+    return [f"Discarded: {told}{others}."]
+
+
+def nis_in_words(mean: float | None, band: list[float]) -> str:
+    """What the mean of the normalised innovations says of a sensor's noise."""
+    if mean is None:
+        return "none was used"
+    if mean > band[1]:
+        return "innovations larger than stated: noise set too low, or the sensor disturbed" if mean > 1.5 else "slightly larger than stated"
+    if mean < band[0]:
+        return "innovations smaller than stated: noise set high, which is cautious" if mean < 0.67 else "slightly smaller than stated"
+    return "as stated"
+
+
+def facts(c: Context) -> list[tuple[str, str]]:
+    """The flight in a few lines: name and value."""
+    solution, flight, summary = c.solution, c.flight, c.solution.summary
+    meta = flight.meta
+    out: list[tuple[str, str]] = []
+
+    def add(name: str, value: str | None) -> None:
+        if value:
+            out.append((name, value))
+
+    add("source", meta.source)
+    add("start (UTC)", meta.start_utc)
+    if meta.time_offset:
+        add("log clock", f"t + {meta.time_offset:.6f} s")
+    if "imu" in flight:
+        imu = flight["imu"]
+        add("duration", f"{c.span[1] - c.span[0]:.1f} s, IMU at {imu.rate:.0f} Hz, {count(len(imu), 'sample')}")
+    add("sensors used", ", ".join(sensor_label(s) for s in dict.fromkeys(solution.aids["sensor"].tolist()) if not s.startswith(("zero", "fake"))) or "IMU only")
+    add("compared with", " and ".join(name for name, _ in c.references) or "nothing: no truth, no onboard solution in the log")
+    if c.origin:
+        add("origin", f"{c.origin[0]:.7f}°, {c.origin[1]:.7f}°, {c.origin[2]:.1f} m above mean sea level")
+    i = int(np.argmax(c.tilt))
+    add("largest tilt", f"{c.tilt[i]:.0f}° at t = {solution.t[i]:.1f} s")
+    if "vel_n" in solution and c.held_by_measurement:
+        ground = np.hypot(solution["vel_n"], solution["vel_e"])
+        k = int(np.argmax(ground))
+        add("fastest", f"{ground[k]:.1f} m/s over ground at t = {solution.t[k]:.1f} s")
+        way = float(np.sum(0.5 * (ground[1:] + ground[:-1]) * np.minimum(np.diff(solution.t), 1.0)))
+        height = -solution["pos_d"]
+        add("track", f"{way:.0f} m long; height {height.min():.1f} to {height.max():.1f} m from the origin")
+    for fault in meta.faults:
+        add("injected fault", ", ".join(f"{k} {v}" for k, v in fault.items()))
+    timings = summary.get("timings", {})
+    if timings.get("filter_s"):
+        add("computed in", f"{timings['filter_s']:.2f} s, haltere {summary.get('haltere', '')}")
+    return out
