@@ -35,7 +35,7 @@ def ekf2_output(path: Path) -> dict[str, np.ndarray]:
     """EKF2's own states: q_nb, velocity and position NED, times [s]; rows before its alignment are left out."""
     a = np.genfromtxt(path, delimiter=",", skip_header=1)
     a = a[np.abs(a[:, 1]) < 0.999999]
-    return {"t": a[:, 0] * 1e-6, "q": a[:, 1:5], "vel": a[:, 5:8], "pos": a[:, 8:11], "variance": a[:, 25:49]}
+    return {"t": a[:, 0] * 1e-6, "q": a[:, 1:5], "vel": a[:, 5:8], "pos": a[:, 8:11], "field": a[:, 17:20], "variance": a[:, 25:49]}
 
 
 def inertialnav(folder: Path, *, gauss: float) -> FlightLog:
@@ -54,17 +54,22 @@ def inertialnav(folder: Path, *, gauss: float) -> FlightLog:
         if len(fixes) == len(gps):
             velocity = fixes[:, 4:7]
     field = mag[:, 2:5] - mag[:, 5:8]
-    q = _quaternions(att[:, 2:5] * DEG)
+    onboard = {}
+    if np.abs(att[:50, 2]).max() < 20.0:  # some of the files have their columns in another order: then there is no reference
+        q = _quaternions(att[:, 2:5] * DEG)
+        onboard = {"onboard": {"t": att[:, 1] * 1e-3} | {f"q_{x}": q[:, k] for k, x in enumerate("wxyz")}}
     streams = {
         "imu": {"t": imu[:, 1] * 1e-3} | {f"gyro_{x}": imu[:, 2 + k] for k, x in enumerate("xyz")} | {f"accel_{x}": imu[:, 5 + k] for k, x in enumerate("xyz")},
         "magnetometer": {"t": mag[:, 1] * 1e-3} | {f"mag_{x}": gauss * field[:, k] for k, x in enumerate("xyz")},
         "gnss": {"t": gps[:, 2] * 1e-3, "lat": gps[:, 6], "lon": gps[:, 7], "alt": gps[:, 9], "fix_type": gps[:, 1]}
         | {f"vel_{x}": velocity[:, k] for k, x in enumerate("ned")},
         "barometer": {"t": ntun[:, 1] * 1e-3, "altitude": ntun[:, 8]},
-        "onboard": {"t": att[:, 1] * 1e-3} | {f"q_{x}": q[:, k] for k, x in enumerate("wxyz")},
+        **onboard,
     }  # fmt: skip
-    delays = {"gnss_velocity": timing[3] * 1e-3, "gnss_position": timing[4] * 1e-3, "barometer": timing[5] * 1e-3, "magnetometer": timing[6] * 1e-3}
-    return FlightLog(streams, FlightMeta(name=folder.name, source="InertialNav text files", delays={k: float(v) for k, v in delays.items()}))
+    delays = dict(zip(("gnss_velocity", "gnss_position", "barometer", "magnetometer"), timing[3:7] * 1e-3, strict=True))
+    return FlightLog(
+        streams, FlightMeta(name=folder.name, source="InertialNav text files", delays={k: float(v) for k, v in delays.items()})
+    )
 
 
 def _quaternions(rpy: np.ndarray) -> np.ndarray:

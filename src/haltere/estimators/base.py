@@ -39,7 +39,7 @@ class State:
 
     @property
     def aligned(self) -> bool:
-        """Has initial alignment been done?"""
+        """Whether initial alignment has been done."""
         return bool(self.record["phase"][0] == 2)
 
     def _vector(self, name: str) -> FloatArray:

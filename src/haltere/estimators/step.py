@@ -89,16 +89,16 @@ def write_covariance(s: Any, prm: Any, cov: Any) -> None:
 
 @jit
 def sound(s: Any) -> bool:
-    """Are state and covariance finite and every variance positive?"""
+    """Whether state and covariance are finite and every variance positive."""
     total = s.q[0] + s.q[1] + s.q[2] + s.q[3]
     for i in range(3):
         total += s.v[i] + s.p[i] + s.bg[i] + s.ba[i]
     if not math.isfinite(total):
         return False
+    ok = True
     for i in range(s.P.shape[0]):
-        if not (s.P[i, i] > 0.0 and s.P[i, i] < 1e14):
-            return False
-    return True
+        ok = ok and s.P[i, i] > 0.0 and s.P[i, i] < 1e14
+    return ok
 
 
 @jit
@@ -134,7 +134,7 @@ def predict_interval(s: Any, prm: Any, w0: Vec, f0: Vec, w1: Vec, f1: Vec, dt: f
 @jit
 def bridge_gap(s: Any, prm: Any, w0: Vec, f0: Vec, w1: Vec, f1: Vec, dt: float) -> None:
     """Predict across missing samples in sub-steps, and admit that nobody knows what happened meanwhile."""
-    n = int(math.ceil(dt / SUB_STEP))
+    n = math.ceil(dt / SUB_STEP)
     h = dt / n
     for i in range(n):
         k0, k1 = i / n, (i + 1) / n

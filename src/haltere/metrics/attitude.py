@@ -36,7 +36,7 @@ def rotation_vector(q: FloatArray) -> FloatArray:
     q = np.where(q[..., :1] < 0.0, -q, q)
     s = np.linalg.norm(q[..., 1:], axis=-1, keepdims=True)
     angle = 2.0 * np.arctan2(s, q[..., :1])
-    return q[..., 1:] * np.where(s > 1e-12, angle / np.maximum(s, 1e-300), 2.0)
+    return np.asarray(q[..., 1:] * np.where(s > 1e-12, angle / np.maximum(s, 1e-300), 2.0))
 
 
 def euler(q: FloatArray) -> FloatArray:

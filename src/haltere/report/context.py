@@ -34,8 +34,8 @@ SENSORS = {
 
 #: Label, unit for reading, factor to it, and resolution of a component of the aid records.
 COMPONENTS: dict[str, tuple[str, str, float, float]] = {
-    **{f"vel_{a}": (f"velocity {w}", "m/s", 1.0, 1e-3) for a, w in zip("ned", ("north", "east", "down"), strict=True)},
-    **{f"pos_{a}": (f"position {w}", "m", 1.0, 1e-3) for a, w in zip("ned", ("north", "east", "down"), strict=True)},
+    **{f"vel_{w[0]}": (f"vel. {w}", "m/s", 1.0, 1e-3) for w in ("north", "east", "down")},
+    **{f"pos_{w[0]}": (f"pos. {w}", "m", 1.0, 1e-3) for w in ("north", "east", "down")},
     "altitude": ("altitude", "m", 1.0, 1e-3),
     "heading": ("heading", "deg", 180.0 / math.pi, 1e-3),
     **{f"mag_{a}": (f"field {a}", "µT", 1.0, 1e-2) for a in "xyz"},
@@ -123,6 +123,12 @@ class Context:
         """Was a position from GNSS ever let in?"""
         a = self.solution.aids
         return bool(np.any((a["sensor"] == "gnss") & (a["status"] != "rejected") & np.char.startswith(a["component"].astype(str), "pos")))
+
+    @cached_property
+    def sensors(self) -> list[str]:
+        """Sensors of the aid records, in the order of `SENSORS`."""
+        present = [str(s) for s in np.unique(self.solution.aids["sensor"])]
+        return [s for s in SENSORS if s in present] + [s for s in present if s not in SENSORS]
 
     def offered(self, sensor: str, component: str) -> Mask:
         """Rows of the aid records of one component, without the sample that only set the start."""

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from haltere.metrics.errors import reference_position
 from haltere.report.context import Context, Section, covered, sensor_label
-from haltere.report.panels import FOOT, plain
+from haltere.report.panels import FOOT, LEFT, plain
 from haltere.report.series import display, thin
 from haltere.report.style import AXES, SENSOR_COLOURS
 
@@ -44,9 +44,9 @@ def track(c: Context) -> Section:
             shown = display(t, [p[:, 0], p[:, 1], p[:, 2]], 2 * c.pool.points)
         ids = [c.pool.add(shown[0], 1e-4), *(c.pool.add(s) for s in shown[1:])]
         points.append((p[:, 0], p[:, 1]))
-        look = {"marker": {"size": 4, "color": f"@{colour}"}} if dots else {"line": {"width": 1.8 if colour == "estimate" else 1.2, "color": f"@{colour}"}}
+        look = {"marker": {"size": 4, "color": f"@{colour}"}} if dots else {"line": {"width": 2.2 if colour == "estimate" else 1.2, "color": f"@{colour}"}}
         traces.append({
-            "type": "scatter", "name": label, "x": {"a": ids[2]}, "y": {"a": ids[1]}, "customdata": {"zip": [ids[0], ids[3]]},
+            "type": "scatter", "name": label, "x": {"$a": ids[2]}, "y": {"$a": ids[1]}, "customdata": {"$zip": [ids[0], ids[3]]},
             "mode": "markers" if dots else "lines", **look,
             "hovertemplate": "N %{y:.2f} m, E %{x:.2f} m, D %{customdata[1]:.2f} m<br>t = %{customdata[0]:.2f} s",
         })  # fmt: skip
@@ -69,7 +69,7 @@ def track(c: Context) -> Section:
     middle, half = _frame(points)
     axis = {**AXES, "zeroline": True, "nticks": 8}
     layout = {
-        "margin": {"l": 62, "r": 12, "t": 6, "b": FOOT}, "hovermode": "closest",
+        "margin": {"l": LEFT, "r": 12, "t": 6, "b": FOOT}, "hovermode": "closest",
         "xaxis": {**axis, "title": {"text": "east [m]", "standoff": 4}, "range": [middle[1] - half, middle[1] + half], "constrain": "domain"},
         "yaxis": {**axis, "title": {"text": "north [m]", "standoff": 6}, "range": [middle[0] - half, middle[0] + half], "scaleanchor": "x",
                   "constrain": "domain"},
@@ -106,7 +106,7 @@ def timeline(c: Context) -> Section:
     rows: list[tuple[str, str, FloatArray]] = []
     if "imu" in c.flight:
         rows.append(("IMU", "imu", c.flight["imu"].t))
-    for sensor in dict.fromkeys(["gnss", "magnetometer", "barometer", *aids["sensor"].tolist()]):
+    for sensor in c.sensors:
         mine = aids["sensor"] == sensor
         if mine.any():
             used = mine & (aids["status"] != "rejected")
@@ -139,7 +139,7 @@ def timeline(c: Context) -> Section:
     n = len(labels)
     height = 26 * n + 16 + FOOT
     layout = {
-        "margin": {"l": 62, "r": 12, "t": 6, "b": FOOT}, "hovermode": "closest",
+        "margin": {"l": LEFT, "r": 12, "t": 6, "b": FOOT}, "hovermode": "closest",
         "xaxis": {**AXES, "range": list(c.span), "title": {"text": "t [s]", "standoff": 4}, "hoverformat": ".3f"},
         "yaxis": {**AXES, "range": [n - 0.4, -0.6], "tickvals": list(range(n)), "ticktext": [plain(x) for x in labels], "showgrid": False,
                   "automargin": True, "fixedrange": True, "ticks": ""},

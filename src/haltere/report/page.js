@@ -63,12 +63,12 @@
     if (Array.isArray(value)) return value.map(resolve);
     if (typeof value === "string") return value.startsWith("@") ? colour(value) : value;
     if (value === null || typeof value !== "object") return value;
-    if ("a" in value) return arrays[value.a];
-    if ("b" in value) return scaled(value.k, arrays[value.b]);
-    if ("zip" in value) return arrays[value.zip[0]].map((_, i) => value.zip.map((id) => arrays[id][i]));
+    if ("$a" in value) return arrays[value.$a];
+    if ("$b" in value) return scaled(value.k, arrays[value.$b]);
+    if ("$zip" in value) return arrays[value.$zip[0]].map((_, i) => value.$zip.map((id) => arrays[id][i]));
     const out = {};
     for (const key of Object.keys(value)) {
-      if (key === "band") Object.assign(out, outline(value.band));
+      if (key === "$band") Object.assign(out, outline(value.$band));
       else out[key] = resolve(value[key]);
     }
     return out;
@@ -90,17 +90,23 @@
       hovermode: layout.hovermode || "x unified",
       hoverlabel: { bgcolor: colour("@panel"), bordercolor: colour("@axis"), font, namelength: -1 },
       legend: { orientation: "h", x: 0, xanchor: "left", y: 1, yanchor: "bottom", font, bgcolor: "rgba(0,0,0,0)" },
-      modebar: { color: colour("@quiet"), activecolor: colour("@estimate"), bgcolor: "rgba(0,0,0,0)", orientation: "v" },
+      modebar: { color: colour("@quiet"), activecolor: colour("@estimate"), bgcolor: "rgba(0,0,0,0)", orientation: "h" },
       dragmode: touch ? false : "zoom",
     });
     if (figure.time && shownTime) for (const k of timeAxes(layout)) layout[k].range = [...shownTime];
     return layout;
   };
 
+  // The buttons are named one by one, so that a newer library adds none that would send something away.
   const configOf = (figure) => ({
-    responsive: true, displaylogo: false, displayModeBar: touch ? false : "hover",
-    modeBarButtonsToRemove: ["select2d", "lasso2d", "autoScale2d"],
-    toImageButtonOptions: { format: "svg", filename: figure.name },
+    responsive: true, displaylogo: false, displayModeBar: touch || innerWidth < 700 ? false : "hover", showSendToCloud: false, plotlyServerURL: "",
+    modeBarButtons: [
+      ["SVG", "PNG"].map((kind) => ({
+        name: kind, title: `Save as ${kind}`, icon: kind === "SVG" ? Plotly.Icons.camera : Plotly.Icons["camera-retro"],
+        click: (div) => Plotly.downloadImage(div, { format: kind.toLowerCase(), filename: figure.name, scale: kind === "PNG" ? 2 : 1 }),
+      })),
+      ["zoom2d", "pan2d", "resetScale2d"],
+    ],
   });
 
   const setWindow = (div) => {

@@ -100,7 +100,7 @@ def _assemble(c: Context, command: str | None) -> str:
 
 def _header(c: Context) -> str:
     said = verdict(c)
-    words = {"good": "good", "doubtful": "with doubts", "bad": "bad"}[said.level]
+    words = {"good": "solution good", "doubtful": "solution doubtful", "bad": "solution bad"}[said.level]
     sentences = "".join(f"<li>{escape(s)}</li>" for s in said.sentences)
     return (
         f'<header>\n<h1>{escape(c.flight.meta.name or "flight")}</h1>\n<section class="verdict {said.level}" id="verdict">'

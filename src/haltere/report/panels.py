@@ -12,13 +12,13 @@ from numpy.typing import NDArray
 from haltere.report.series import Pool, display
 from haltere.report.style import AXES
 
-__all__ = ["Figure", "Panels", "plain"]
+__all__ = ["FOOT", "LEFT", "Figure", "Panels", "plain"]
 
 FloatArray = NDArray[np.float64]
 Figure = dict[str, Any]
 
-#: Pixels of one panel, between panels, and for the time axis; markers shown at most a series.
-ROW, GAP, FOOT, MARKERS = 150, 14, 44, 300
+#: Pixels of one panel, between panels, below and left of them; markers shown at most a series.
+ROW, GAP, FOOT, LEFT, MARKERS = 150, 14, 44, 74, 300
 
 
 def plain(text: object) -> str:
@@ -69,7 +69,7 @@ class Panels:
 
     def line(
         self, row: int, label: str, colour: str, t: FloatArray, y: FloatArray, sd: FloatArray | None = None, *, unit: str = "",
-        resolution: float = 1e-3, period: float | None = None, width: float = 1.4, centred: bool = False, sigmas: str = "1σ",
+        resolution: float = 1e-3, period: float | None = None, width: float = 1.9, centred: bool = False, sigmas: str = "1σ",
     ) -> None:
         """A line, with its band of one standard deviation where ``sd`` is given: about the line, or about zero (``centred``)."""
         columns = [y] if sd is None else [y, sd]
@@ -84,19 +84,19 @@ class Panels:
             known = shown[2][np.isfinite(shown[2])]
             reach = 1.5 * float(np.median(known)) if len(known) else 0.0
             band = {"t": ids[0], "y": None if centred else ids[1], "sd": ids[2]}
-            self._trace(row, f"{label} ±{sigmas}" if not centred else f"±{sigmas}", band=band, mode="lines", fill="toself", hoverinfo="skip",
+            self._trace(row, f"{label} ±{sigmas}" if not centred else f"±{sigmas}", **{"$band": band}, mode="lines", fill="toself", hoverinfo="skip",
                         fillcolor=f"@{'limit' if centred else colour}/0.22", line={"width": 0})  # fmt: skip
         low, high = float(finite.min()), float(finite.max())
         self._widen(row, *((min(low, -reach), max(high, reach)) if centred else (low - reach, high + reach)))
         few = len(finite) <= 60
         trace: dict[str, Any] = {
-            "x": {"a": ids[0]}, "y": {"a": ids[1]}, "mode": "lines+markers" if few else "lines", "line": {"color": f"@{colour}", "width": width},
+            "x": {"$a": ids[0]}, "y": {"$a": ids[1]}, "mode": "lines+markers" if few else "lines", "line": {"color": f"@{colour}", "width": width},
             "hovertemplate": f"%{{y:.4~g}}{' ± %{customdata:.2~g}' if sd is not None else ''} {unit}",
         }  # fmt: skip
         if few:
             trace["marker"] = {"size": 4, "color": f"@{colour}"}
         if sd is not None:
-            trace["customdata"] = {"a": ids[2]}
+            trace["customdata"] = {"$a": ids[2]}
         self._trace(row, label, **trace)
         self.drawn.add(row)
 
@@ -107,7 +107,7 @@ class Panels:
             return
         x, b = self.pool.add(shown[0], 1e-4), self.pool.add(shown[1], resolution)
         for sign in (1.0, -1.0):
-            self._trace(row, label, x={"a": x}, y={"b": b, "k": sign}, mode="lines", hoverinfo="skip",
+            self._trace(row, label, x={"$a": x}, y={"$b": b, "k": sign}, mode="lines", hoverinfo="skip",
                         line={"color": f"@{colour}", "width": 1, "dash": "dot"})  # fmt: skip
 
     def markers(
@@ -124,7 +124,7 @@ class Panels:
         if widen:
             self._widen(row, float(y[rows].min()), float(y[rows].max()))
         trace: dict[str, Any] = {
-            "x": {"a": self.pool.add(t[rows], 1e-4)}, "y": {"a": self.pool.add(y[rows], resolution)}, "mode": "markers",
+            "x": {"$a": self.pool.add(t[rows], 1e-4)}, "y": {"$a": self.pool.add(y[rows], resolution)}, "mode": "markers",
             "marker": {"symbol": symbol, "size": size, "color": f"@{colour}"}, "hovertemplate": f"%{{y:.4~g}} {unit}",
         }  # fmt: skip
         if texts is not None:
@@ -149,7 +149,7 @@ class Panels:
         """The figure: name, traces, layout, height and that its x axis is time."""
         n = len(self.titles)
         inner = n * self.row + (n - 1) * GAP
-        layout: dict[str, Any] = {"shapes": self.shapes, "margin": {"l": 62, "r": 12, "t": 6, "b": FOOT}}
+        layout: dict[str, Any] = {"shapes": self.shapes, "margin": {"l": LEFT, "r": 12, "t": 6, "b": FOOT}}
         for k, title in enumerate(self.titles):
             top = 1.0 - k * (self.row + GAP) / inner
             number = "" if k == 0 else str(k + 1)

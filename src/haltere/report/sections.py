@@ -40,7 +40,7 @@ def attitude(c: Context) -> Section:
         for name, stream in c.references:
             q = stream.vector("q", "wxyz")
             good = np.isfinite(q).all(axis=1)
-            panels.line(k, name, name, stream.t[good], DEG * euler(q[good])[:, k], unit="deg", period=period, width=1.1)
+            panels.line(k, name, name, stream.t[good], DEG * euler(q[good])[:, k], unit="deg", period=period, width=1.0)
     return Section("attitude", "Attitude", "Roll right side down, pitch nose up, yaw from true north towards east.", [panels.figure()])
 
 
@@ -52,10 +52,10 @@ def velocity(c: Context) -> Section:
     panels.reversed = {2}
     for k, a in enumerate("ned"):
         t, v = c.measured(f"vel_{a}")
-        panels.line(k, "GNSS", "gnss", t, v, unit="m/s", width=1.1)
+        panels.line(k, "GNSS", "gnss", t, v, unit="m/s", width=1.0)
         panels.line(k, "estimate", "estimate", c.solution.t, c.solution[f"vel_{a}"], _sd(c, f"sd_vel_{a}"), unit="m/s")
         for name, stream in c.references:
-            panels.line(k, name, name, stream.t, stream.get(f"vel_{a}"), unit="m/s", width=1.1)
+            panels.line(k, name, name, stream.t, stream.get(f"vel_{a}"), unit="m/s", width=1.0)
     return Section("velocity", "Velocity", "Over ground, north, east and down; the axis of down points down, so that climbing goes up.", [panels.figure()])
 
 
@@ -70,13 +70,13 @@ def position(c: Context) -> Section:
     panels.reversed = {2}
     for k, a in enumerate("ned"):
         t, p = c.measured(f"pos_{a}")
-        panels.line(k, "GNSS", "gnss", t, p, unit="m", width=1.1)
+        panels.line(k, "GNSS", "gnss", t, p, unit="m", width=1.0)
         if a == "d":
             _barometer(c, panels, k)
         panels.line(k, "estimate", "estimate", c.solution.t, c.solution[f"pos_{a}"], _sd(c, f"sd_pos_{a}"), unit="m")
         for name, stream in c.references:
             tp, p = reference_position(stream, list(c.origin) if c.origin else None)
-            panels.line(k, name, name, tp, p[:, k], unit="m", width=1.1)
+            panels.line(k, name, name, tp, p[:, k], unit="m", width=1.0)
     return Section("position", "Position", note, [panels.figure()])
 
 
@@ -102,7 +102,7 @@ def biases(c: Context) -> Section:
         y = factor * c.solution[name]
         panels.line(k, "estimate", "estimate", c.solution.t, y, _sd(c, f"sd_{name}", factor), unit=unit, resolution=resolution)
         for label, stream in c.references:
-            panels.line(k, label, label, stream.t, factor * stream.get(name), unit=unit, resolution=resolution, width=1.1)
+            panels.line(k, label, label, stream.t, factor * stream.get(name), unit=unit, resolution=resolution, width=1.0)
     return Section("biases", "Sensor biases", "Measured minus true; the estimate is subtracted from the sensor.", [panels.figure()])
 
 
@@ -115,7 +115,7 @@ def wind(c: Context) -> Section | None:
     for k, a in enumerate(axes):
         panels.line(k, "estimate", "estimate", c.solution.t, c.solution[f"wind_{a}"], _sd(c, f"sd_wind_{a}"), unit="m/s")
         for name, stream in c.references:
-            panels.line(k, name, name, stream.t, stream.get(f"wind_{a}"), unit="m/s", width=1.1)
+            panels.line(k, name, name, stream.t, stream.get(f"wind_{a}"), unit="m/s", width=1.0)
     return Section("wind", "Wind", "Velocity of the air over ground: where it blows to.", [panels.figure()])
 
 
@@ -128,10 +128,7 @@ def errors(c: Context) -> Section | None:
     names = [n for n in ("roll", "pitch", "yaw", "vel_n", "vel_e", "vel_d", "pos_n", "pos_e", "pos_d") if n in series]
     if not names:
         return None
-    titles = []
-    for name in names:
-        stem, _, axis = name.rpartition("_")
-        titles.append(f"{name} [deg]" if not stem else f"{'vel.' if stem == 'vel' else 'pos.'} {WORDS[axis]} {'[m/s]' if stem == 'vel' else '[m]'}")
+    titles = [f"{COMPONENTS[n][0]} [{COMPONENTS[n][1]}]" if n in COMPONENTS else f"{n} [deg]" for n in names]
     panels = _panels(c, "errors", titles, 112)
     for k, name in enumerate(names):
         factor, unit = (DEG, "deg") if "_" not in name else (1.0, "m/s" if name.startswith("vel") else "m")
@@ -147,16 +144,14 @@ def errors(c: Context) -> Section | None:
 
 def innovations(c: Context) -> Section:
     """Innovations a sensor and component with ±1σ, the gate, and what was refused or de-weighted."""
-    a = c.solution.aids
     section = Section("innovations", "Innovations", "Measured minus predicted, before each update. " + _legend_note())
     beyond = 0
-    present = list(dict.fromkeys(a["sensor"].tolist()))
-    for sensor in [s for s in _ORDER if s in present] + [s for s in present if s not in _ORDER]:
+    for sensor in c.sensors:
         components = [k for k in COMPONENTS if c.offered(sensor, k).any()]
         if not components:
             continue
         titles = [f"{COMPONENTS[k][0]} [{COMPONENTS[k][1]}]" for k in components]
-        panels = _panels(c, f"innovations_{sensor}", titles, 112)
+        panels = _panels(c, f"innovations_{sensor}", titles, 112 if sensor in SENSOR_COLOURS else 96)
         for k, component in enumerate(components):
             beyond += _innovation(c, panels, k, sensor, component)
         figure = panels.figure()
@@ -167,9 +162,6 @@ def innovations(c: Context) -> Section:
     elif beyond:
         section.note += f" {beyond} refused samples lie beyond the axes shown; a double click on a panel shows them."
     return section
-
-
-_ORDER = ("gnss", "magnetometer", "barometer", "zero_velocity", "zero_rate", "fake_position", "fake_velocity")
 
 
 def _legend_note() -> str:

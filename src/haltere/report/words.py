@@ -35,6 +35,11 @@ def number(value: float | None, digits: int = 3) -> str:
     return f"{float(shown):.0f}" if "e" in shown else shown
 
 
+def fixed(value: float) -> str:
+    """A number for a sentence: two digits below one, one decimal above."""
+    return f"{value:#.2g}" if 1e-3 <= abs(value) < 0.995 else f"{value:.1f}" if abs(value) < 1e4 else f"{value:.1e}"
+
+
 def count(n: int, thing: str) -> str:
     """``1 sample``, ``28 samples``, ``12,345 samples``."""
     return f"{n:,} {thing}{'' if n == 1 else 's'}"
@@ -135,19 +140,19 @@ def _quality(c: Context) -> list[str]:
         parts = []
         angles = [(k, rows[f"{k}_deg"]["rms"]) for k in ("roll", "pitch", "yaw") if f"{k}_deg" in rows]
         if angles:
-            parts.append(f"{', '.join(f'{k} {number(v)}°' for k, v in angles)}")
+            parts.append(", ".join(f"{k} {fixed(v)}°" for k, v in angles))
         for stem, word, unit in (("vel", "velocity", "m/s"), ("pos", "position", "m")):
             axes = [rows[f"{stem}_{a}"]["rms"] for a in "ned" if f"{stem}_{a}" in rows]
             if axes:
-                parts.append(f"{word} {' / '.join(number(v) for v in axes)} {unit}{' north / east / down' if len(axes) == 3 and stem == 'vel' else ''}")
+                parts.append(f"{word} {' / '.join(fixed(v) for v in axes)} {unit}")
         if parts:
-            what = "RMS error against truth" if name == "truth" else f"RMS difference from the {name} solution, which is another estimate and no truth"
+            what = "RMS error against truth (north / east / down)" if name == "truth" else f"RMS difference from the {name} solution (north / east / down; it is another estimate, no truth)"
             out.append(f"{what}: {'; '.join(parts)}.")
     sd = {k: float(np.median(c.solution[f"sd_{k}"])) for k in ("roll", "pitch", "yaw", "vel_n", "vel_e", "vel_d", "pos_n", "pos_e", "pos_d") if f"sd_{k}" in c.solution}
-    parts = [f"{k} {number(math.degrees(sd[k]), 2)}°" for k in ("roll", "pitch", "yaw") if k in sd]
+    parts = [f"{k} {fixed(math.degrees(sd[k]))}°" for k in ("roll", "pitch", "yaw") if k in sd]
     for stem, word, unit in (("vel", "velocity", "m/s"), ("pos", "position", "m")):
         if f"{stem}_n" in sd:
-            parts.append(f"{word} {' / '.join(number(sd[f'{stem}_{a}'], 2) for a in 'ned')} {unit}")
+            parts.append(f"{word} {' / '.join(fixed(sd[f'{stem}_{a}']) for a in 'ned')} {unit}")
     out.append(f"Stated 1σ, median over the flight: {', '.join(parts)}.")
     return out
 
@@ -193,7 +198,7 @@ def facts(c: Context) -> list[tuple[str, str]]:
     if "imu" in flight:
         imu = flight["imu"]
         add("duration", f"{c.span[1] - c.span[0]:.1f} s, IMU at {imu.rate:.0f} Hz, {count(len(imu), 'sample')}")
-    add("sensors used", ", ".join(sensor_label(s) for s in dict.fromkeys(solution.aids["sensor"].tolist()) if not s.startswith(("zero", "fake"))) or "IMU only")
+    add("sensors used", ", ".join(sensor_label(s) for s in c.sensors if not s.startswith(("zero", "fake"))) or "IMU only")
     add("compared with", " and ".join(name for name, _ in c.references) or "nothing: no truth, no onboard solution in the log")
     if c.origin:
         add("origin", f"{c.origin[0]:.7f}°, {c.origin[1]:.7f}°, {c.origin[2]:.1f} m above mean sea level")

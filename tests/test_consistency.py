@@ -1,0 +1,80 @@
+"""Is the reported uncertainty true? NEES over independent simulated flights, initial errors drawn from P0, matched noise."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from haltere.core.rotation import quat_from_rotvec
+from haltere.drive import run
+from haltere.estimators.base import InitialState
+from haltere.flight.log import FlightLog
+from haltere.metrics.attitude import multiply
+from haltere.metrics.consistency import DOF, band, nees_series
+from haltere.simulate import demo_flight
+
+#: 1 sigma of the initial errors: attitude [rad], velocity [m/s], position [m], gyro bias [rad/s], accelerometer bias [m/s^2], offset [m].
+SD = np.r_[np.radians([5.0, 5.0, 10.0]), np.full(3, 0.5), np.full(3, 1.0), np.full(3, 0.01), np.full(3, 0.2), 2.0]
+
+
+def _start(flight: FlightLog, rng: np.random.Generator) -> InitialState:
+    """Truth at the first sample, less an error drawn from P0. The biases' errors are the simulated biases themselves."""
+    truth = flight["truth"]
+    e = SD * rng.standard_normal(len(SD))
+    return InitialState(
+        t=float(flight["imu"].t[0]),
+        q_nb=multiply(truth.vector("q", "wxyz")[0], np.array(quat_from_rotvec((-e[0], -e[1], -e[2])))),
+        vel_n=truth.vector("vel", "ned")[0] - e[3:6],
+        pos_n=truth.vector("pos", "ned")[0] - e[6:9],
+        gyro_bias_b=np.zeros(3),
+        accel_bias_b=np.zeros(3),
+        P=np.diag(SD**2),
+        baro_bias=0.0,
+    )
+
+
+def _mean_nees(flights: int, first_seed: int) -> tuple[dict[str, float], dict[str, float]]:
+    nees: dict[str, list[float]] = {}
+    nis: dict[str, list[float]] = {}
+    for k in range(flights):
+        flight = demo_flight(first_seed + k, 60.0, rest=0.0, gyro_bias_sd=0.01, accel_bias_sd=0.2)
+        solution = run(flight, initial=_start(flight, np.random.default_rng([7, first_seed + k])))
+        for block, (_, value) in nees_series(solution, flight["truth"]).items():
+            nees.setdefault(block, []).append(float(value.mean()))
+        for sensor, row in solution.summary["nis"].items():
+            nis.setdefault(sensor, []).append(row["mean"])
+    return {b: float(np.mean(v)) for b, v in nees.items()}, {s: float(np.mean(v)) for s, v in nis.items()}
+
+
+def test_nees_of_50_flights_is_inside_the_band() -> None:
+    """Every block inside the 99.9 % χ² band of 50 independent flights (samples of one flight are not independent)."""
+    nees, nis = _mean_nees(50, 500)
+    assert set(nees) == set(DOF)
+    for block, value in nees.items():
+        low, high = band(DOF[block], 50.0, 0.999)
+        assert low < value < high, (block, value, low, high)
+    for sensor in ("gnss", "barometer", "magnetometer"):
+        assert 0.93 < nis[sensor] < 1.07, (sensor, nis[sensor])
+
+
+@pytest.mark.slow
+def test_nees_of_200_flights_is_inside_the_band() -> None:
+    nees, _ = _mean_nees(200, 2000)
+    for block, value in nees.items():
+        low, high = band(DOF[block], 200.0, 0.999)
+        assert low < value < high, (block, value, low, high)
+
+
+def test_the_check_can_fail() -> None:
+    """A filter told half the noise is caught by the same band."""
+    low, high = band(3.0, 10.0, 0.999)
+    values = []
+    for k in range(10):
+        flight = demo_flight(900 + k, 40.0, rest=0.0, gyro_bias_sd=0.01, accel_bias_sd=0.2)
+        lied = {"noise.gyro": 4e-4, "noise.accel": 0.009, "noise.gnss_velocity_min": 0.01}
+        columns = dict(flight["gnss"].columns)
+        columns["s_acc"] = columns["s_acc"] / 3.0
+        flight.streams["gnss"] = type(flight["gnss"])(columns)
+        solution = run(flight, set=lied, initial=_start(flight, np.random.default_rng([8, k])))
+        values.append(float(nees_series(solution, flight["truth"])["velocity"][1].mean()))
+    assert not low < np.mean(values) < high
