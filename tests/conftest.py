@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import os
+
+os.environ.setdefault("HALTERE_JIT", "open")  # inner kernels are called from Python here; set before haltere is imported
 from pathlib import Path
 
 import pytest
@@ -24,3 +26,7 @@ def shared_data() -> Path:
             pytest.fail(message)
         pytest.skip(message)
     return folder
+
+
+def pytest_addoption(parser: pytest.Parser) -> None:
+    parser.addoption("--update", action="store_true", help="write the golden replays anew; review their diff before committing")

@@ -23,6 +23,7 @@ from haltere.flight.local import geodetic_from_local
 from haltere.flight.log import FlightLog
 from haltere.flight.solution import Solution
 from haltere.metrics.summary import summarise
+from haltere.strapdown.layout import IMU_CAPACITY
 
 __all__ = ["run"]
 
@@ -100,19 +101,18 @@ def run(
     prepared = time.perf_counter()
 
     S, prm = new_state(resolved, initial), parameters(resolved)
-    rows = np.empty((int(kernels.row_count(S["baro"].shape[1])), len(t)))
-    cov = np.empty((kernels.COVARIANCE_ROWS, int((t[-1] - t[0]) / 0.1) + 64 if len(t) else 1))
-    aids_parts, events = _loop(S, prm, t, gyro, accel, offered, rows, cov, progress)
+    cov = np.empty((kernels.COVARIANCE_ROWS, int((t[-1] - t[0]) / 0.1) + 64))
+    rows, aids_parts, events = _loop(S, prm, t, gyro, accel, offered, cov, progress)
     filtered = time.perf_counter()
 
-    n = int(S["n_rows"][0])
+    n = rows.shape[1]
     if n == 0:
         raise HaltereError(
             "an alignment (a second at rest, or motion with GNSS velocity, or five seconds of any motion)",
             f"{t[-1] - t[0]:.1f} s of IMU that allowed none", f"{flight.meta.name or 'flight'}: initial alignment",
             "give the estimator a longer stretch of data, or an initial state",
         )  # fmt: skip
-    table = _table(rows, n, S, specification.POSITION)
+    table = _table(rows, S, specification.POSITION)
     if rate is not None:
         keep = _decimate(table["t"], rate)
         table = {name: column[keep] for name, column in table.items()}
@@ -128,23 +128,35 @@ def _loop(
     gyro: FloatArray,
     accel: FloatArray,
     m: Measurements,
-    rows: FloatArray,
     cov: FloatArray,
     progress: Callable[[float], None] | None,
-) -> tuple[list[NDArray[np.void]], list[dict[str, Any]]]:
-    """Drive the compiled step over the whole log, draining records and events between chunks."""
+) -> tuple[FloatArray, list[NDArray[np.void]], list[dict[str, Any]]]:
+    """Drive the compiled step over the whole log, draining rows, records and events between chunks; rows come back as columns."""
+    width = int(kernels.row_width(S["baro"].shape[1]))
+    columns = np.empty((width, len(t)))
+    chunk = np.empty((CHUNK + 4 * IMU_CAPACITY, width))
     aids = np.empty(AID_ROOM, AID_RECORD)
     parts: list[NDArray[np.void]] = []
     events: list[dict[str, Any]] = []
+    filled = 0
+
+    def drain() -> None:
+        nonlocal filled
+        n = int(S["n_rows"][0])
+        columns[:, filled : filled + n] = chunk[:n].T
+        filled += n
+        S["n_rows"] = 0
+        _drain(S, aids, parts, events)
+
     i = j = 0
     while i < len(t):
-        i, j = kernels.run_chunk(S, prm, t, gyro, accel, i, min(i + CHUNK, len(t)), m.kind, m.t, m.z, m.r, j, rows, cov, aids)
-        _drain(S, aids, parts, events)
+        i, j = kernels.run_chunk(S, prm, t, gyro, accel, i, min(i + CHUNK, len(t)), m.kind, m.t, m.z, m.r, j, chunk, cov, aids)
+        drain()
         if progress is not None:
             progress(i / len(t))
-    kernels.flush(S, prm, rows, cov, aids)
-    _drain(S, aids, parts, events)
-    return parts, events
+    kernels.flush(S, prm, chunk, cov, aids)
+    drain()
+    return columns[:, :filled], parts, events
 
 
 def _drain(S: NDArray[np.void], aids: NDArray[np.void], parts: list[NDArray[np.void]], events: list[dict[str, Any]]) -> None:
@@ -174,10 +186,9 @@ def _event(kind: str, sensor: str, t: float, value: float, bank: bool) -> dict[s
     }  # fmt: skip
 
 
-def _table(rows: FloatArray, n: int, S: NDArray[np.void], position: bool) -> dict[str, FloatArray]:
+def _table(rows: FloatArray, S: NDArray[np.void], position: bool) -> dict[str, FloatArray]:
     """Columns of the solution from the raw output rows; variances become standard deviations in place."""
     baro = S["baro"].shape[1]
-    rows = rows[:, :n]
     out = {"t": rows[0]} | {f"q_{a}": rows[1 + k] for k, a in enumerate("wxyz")}
     sd_roll, sd_pitch, sd_yaw = _euler_sd(rows[1:5], rows[17:23])
     np.sqrt(rows[23:35], out=rows[23:35])

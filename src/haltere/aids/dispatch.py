@@ -87,3 +87,10 @@ def fuse_all(s: Any, prm: Any, aids: Any, dt: float, w: Vec, f: Vec) -> None:
             fuse_offer(s, aids, t, sensor, offer_of(s, prm, sensor, m, aids, dt, w, resting))
         if i < 0 or sensor >= N_QUEUED:  # a queue is emptied before the next sensor
             sensor += 1
+    wake = s.aid[N_QUEUED].t_due
+    for k in range(N_SENSORS):
+        if k >= N_QUEUED:
+            wake = min(wake, s.aid[k].t_due)
+        elif s.ring_n[k] > 0:
+            wake = min(wake, s.ring[k, s.ring_head[k]].t)
+    s.t_wake = wake

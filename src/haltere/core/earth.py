@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 
-from haltere._jit import jit
+from haltere._jit import entry, jit
 
 __all__ = ["STANDARD_GRAVITY", "geodetic_from_local", "gravity", "local_from_geodetic", "pressure_altitude", "radii"]
 
@@ -16,7 +16,7 @@ E2_WGS84 = 6.69437999014e-3
 DEG = math.pi / 180.0
 
 
-@jit
+@entry
 def gravity(lat: float, alt: float) -> float:
     """Normal gravity [m/s^2] at latitude [deg] and altitude [m] (Somigliana with free-air term, theory-amendments.md §8)."""
     s2 = math.sin(lat * DEG) ** 2

@@ -218,6 +218,7 @@ def start(s: Any, prm: Any, kind: int, f_b: Vec, a_n: Vec) -> None:
     a.kind = kind
     s.phase = 2
     s.t_aligned = s.t
+    s.t_wake = s.t
     event(s, s.t, E_ALIGNED if s.n_aligned == 0 else E_REALIGNED, 0, float(kind))
     s.n_aligned += 1
 

@@ -11,10 +11,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from haltere._jit import jit
+from haltere._jit import entry
 from haltere.aids.record import BAROMETER, GNSS_POSITION, GNSS_VELOCITY, MAGNETOMETER
 from haltere.core.earth import pressure_altitude
-from haltere.core.rotation import dcm, quat_unit
+from haltere.core.rotation import Quat, dcm, mat_vec, quat_unit
 from haltere.errors import HaltereError, UsageError
 from haltere.flight import config as configuration
 from haltere.flight.config import KEYS, Config
@@ -121,7 +121,16 @@ def _mounted(flight: FlightLog, stream: str, vectors: FloatArray) -> FloatArray:
         return np.ascontiguousarray(vectors)
     if not math.isfinite(sum(q)) or abs(math.sqrt(sum(x * x for x in q)) - 1.0) > 1e-2:
         raise HaltereError("a unit quaternion q_b_sensor", f"{q}", f"flight.toml [mounting] {stream}")
-    return np.ascontiguousarray(vectors @ np.array(dcm(quat_unit(tuple(q)))).T)  # type: ignore[arg-type]
+    out = np.empty_like(vectors)
+    _turn(np.ascontiguousarray(vectors), tuple(float(x) for x in q), out)
+    return out
+
+
+@entry
+def _turn(vectors: Any, q: Quat, out: Any) -> None:
+    C = dcm(quat_unit(q))
+    for i in range(len(vectors)):
+        out[i, 0], out[i, 1], out[i, 2] = mat_vec(C, (vectors[i, 0], vectors[i, 1], vectors[i, 2]))
 
 
 def imu_arrays(flight: FlightLog, checked: Checked) -> tuple[FloatArray, FloatArray, FloatArray]:
@@ -130,7 +139,7 @@ def imu_arrays(flight: FlightLog, checked: Checked) -> tuple[FloatArray, FloatAr
     return imu.t, _mounted(flight, "imu", imu.vector("gyro")), _mounted(flight, "imu", imu.vector("accel"))
 
 
-@jit
+@entry
 def _altitudes(pressure: Any, scale: float, out: Any) -> None:
     for i in range(len(pressure)):
         out[i] = scale * pressure_altitude(pressure[i])

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from typing import Any
 
-from haltere._jit import jit
+from haltere._jit import entry, jit
 from haltere.aids import rest
 from haltere.aids.dispatch import fuse_all
 from haltere.aids.record import (
@@ -22,7 +22,7 @@ from haltere.estimators import alignment, yaw_bank
 from haltere.filter.queue import pop_imu, push, push_imu
 from haltere.strapdown.propagate import predict
 
-__all__ = ["COVARIANCE_ROWS", "advance", "flush", "now", "offer", "row_count", "run_chunk", "step"]
+__all__ = ["COVARIANCE_ROWS", "advance", "flush", "now", "offer", "row_width", "run_chunk", "step"]
 
 #: Rows of the covariance output: time, the upper triangles of the five core blocks, the variance of the barometer offset.
 COVARIANCE_ROWS = 1 + 5 * 6 + 1
@@ -30,9 +30,9 @@ COVARIANCE_ROWS = 1 + 5 * 6 + 1
 LONG_STEP, SUB_STEP = 0.1, 0.05
 
 
-@jit
-def row_count(n_baro: int) -> int:
-    """Rows of the output array: t, q 4, v 3, p 3, bg 3, ba 3, baro; P_θθ upper triangle 6, other variances 12, baro."""
+@entry
+def row_width(n_baro: int) -> int:
+    """Columns of the output rows: t, q 4, v 3, p 3, bg 3, ba 3, baro; P_θθ upper triangle 6, other variances 12, baro."""
     return 35 + 2 * n_baro
 
 
@@ -40,30 +40,30 @@ def row_count(n_baro: int) -> int:
 def write_row(s: Any, rows: Any) -> None:
     """Append the state and the variances that a solution reports."""
     i = s.n_rows
-    if i >= rows.shape[1]:
+    if i >= rows.shape[0]:
         return
     P = s.P
-    rows[0, i] = s.t
+    rows[i, 0] = s.t
     for j in range(4):
-        rows[1 + j, i] = s.q[j]
+        rows[i, 1 + j] = s.q[j]
     for j in range(3):
-        rows[5 + j, i] = s.v[j]
-        rows[8 + j, i] = s.p[j]
-        rows[11 + j, i] = s.bg[j]
-        rows[14 + j, i] = s.ba[j]
-        rows[23 + j, i] = P[3 + j, 3 + j]
-        rows[26 + j, i] = P[6 + j, 6 + j]
-        rows[29 + j, i] = P[9 + j, 9 + j]
-        rows[32 + j, i] = P[12 + j, 12 + j]
-    rows[17, i] = P[0, 0]
-    rows[18, i] = P[0, 1]
-    rows[19, i] = P[0, 2]
-    rows[20, i] = P[1, 1]
-    rows[21, i] = P[1, 2]
-    rows[22, i] = P[2, 2]
+        rows[i, 5 + j] = s.v[j]
+        rows[i, 8 + j] = s.p[j]
+        rows[i, 11 + j] = s.bg[j]
+        rows[i, 14 + j] = s.ba[j]
+        rows[i, 23 + j] = P[3 + j, 3 + j]
+        rows[i, 26 + j] = P[6 + j, 6 + j]
+        rows[i, 29 + j] = P[9 + j, 9 + j]
+        rows[i, 32 + j] = P[12 + j, 12 + j]
+    rows[i, 17] = P[0, 0]
+    rows[i, 18] = P[0, 1]
+    rows[i, 19] = P[0, 2]
+    rows[i, 20] = P[1, 1]
+    rows[i, 21] = P[1, 2]
+    rows[i, 22] = P[2, 2]
     for j in range(len(s.baro)):
-        rows[35 + j, i] = s.baro[j]
-        rows[35 + len(s.baro) + j, i] = P[15 + j, 15 + j]
+        rows[i, 35 + j] = s.baro[j]
+        rows[i, 35 + len(s.baro) + j] = P[15 + j, 15 + j]
     s.n_rows = i + 1
 
 
@@ -209,7 +209,8 @@ def advance(s: Any, prm: Any, rows: Any, cov: Any, aids: Any) -> None:
             predict_interval(s, prm, w0, f0, w1, f1, dt)
         s.yaw.dv[0] += s.v[0] - north
         s.yaw.dv[1] += s.v[1] - east
-        fuse_all(s, prm, aids, dt, w1, f1)
+        if t >= s.t_wake:
+            fuse_all(s, prm, aids, dt, w1, f1)
         if s.yaw.fresh == 1:
             s.yaw.fresh = 0
             if prm.aid_yaw_bank > 0.0:
@@ -223,7 +224,7 @@ def advance(s: Any, prm: Any, rows: Any, cov: Any, aids: Any) -> None:
     write_covariance(s, prm, cov)
 
 
-@jit
+@entry
 def step(S: Any, PRM: Any, t: float, gyro: Vec, accel: Vec, rows: Any, cov: Any, aids: Any) -> int:
     """Take one IMU sample, and move the horizon as far as ``horizon`` behind it.
 
@@ -260,7 +261,7 @@ def step(S: Any, PRM: Any, t: float, gyro: Vec, accel: Vec, rows: Any, cov: Any,
     return 0
 
 
-@jit
+@entry
 def flush(S: Any, PRM: Any, rows: Any, cov: Any, aids: Any) -> None:
     """Move the horizon to the newest IMU sample: the end of a log."""
     s, prm = S[0], PRM[0]
@@ -268,7 +269,7 @@ def flush(S: Any, PRM: Any, rows: Any, cov: Any, aids: Any) -> None:
         advance(s, prm, rows, cov, aids)
 
 
-@jit
+@entry
 def offer(S: Any, PRM: Any, kind: int, t: float, z: Vec, r: Vec) -> int:
     """Queue a measurement stamped t by the time it was valid; see `filter.queue.push` for what comes back, 2 when switched off."""
     s, prm = S[0], PRM[0]
@@ -286,7 +287,7 @@ def offer(S: Any, PRM: Any, kind: int, t: float, z: Vec, r: Vec) -> int:
     return push(s, kind, t - delay, z, r)
 
 
-@jit
+@entry
 def run_chunk(
     S: Any,
     PRM: Any,
@@ -325,7 +326,7 @@ def run_chunk(
     """
     s = S[0]
     while i < i_end:
-        if s.n_aids > len(aids) - 2048 or s.n_events > len(s.event) - 8:
+        if s.n_aids > len(aids) - 2048 or s.n_events > len(s.event) - 8 or s.n_rows > rows.shape[0] - 2 * len(s.imu):
             break
         while j < len(stamps) and stamps[j] <= t[i]:
             offer(S, PRM, kinds[j], stamps[j], (z[j, 0], z[j, 1], z[j, 2]), (r[j, 0], r[j, 1], r[j, 2]))
@@ -335,7 +336,7 @@ def run_chunk(
     return i, j
 
 
-@jit
+@entry
 def now(S: Any, PRM: Any, out: Any) -> None:
     """State predicted to the newest IMU sample by repeating the queued increments: t, q, v, p into ``out`` (11)."""
     s, prm = S[0], PRM[0]

@@ -70,6 +70,7 @@ def push(s: Any, kind: int, t: float, z: Vec, r: Vec) -> int:
     m.z[0], m.z[1], m.z[2] = z
     m.r[0], m.r[1], m.r[2] = r
     s.ring_n[kind] = n + 1
+    s.t_wake = min(s.t_wake, t)
     return -1 if full else 1
 
 

@@ -109,7 +109,11 @@ class Context:
     @cached_property
     def event_times(self) -> list[float]:
         """Times of what happened apart from the first alignment, at most forty."""
-        times = [e.get("t_onset") if e.get("t_onset") is not None else e.get("t_detected") for e in self.solution.events if e["kind"] != "aligned"]
+        times = [
+            e.get("t_onset") if e.get("t_onset") is not None else e.get("t_detected")
+            for e in self.solution.events
+            if e["kind"] != "aligned"
+        ]
         return [float(t) for t in times if t is not None][:40]
 
     @cached_property
@@ -184,7 +188,9 @@ def _stretches(sensor: str, stem: str, status: str, t: FloatArray, reasons: NDAr
     for k in range(int(group[-1]) + 1):
         mine = group == k
         n = len(np.unique(t[mine]))
-        out.append(Episode(sensor, what, status, float(t[mine][0]), float(t[mine][-1]), n, tuple(sorted(set(reasons[mine].tolist()) - {""}))))
+        out.append(
+            Episode(sensor, what, status, float(t[mine][0]), float(t[mine][-1]), n, tuple(sorted(set(reasons[mine].tolist()) - {""})))
+        )
     return out
 
 

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from haltere.metrics.errors import reference_position
 from haltere.report.context import Context, Section, covered, sensor_label
-from haltere.report.panels import FOOT, LEFT, plain
+from haltere.report.panels import FOOT, LEFT, TOP, pen, plain
 from haltere.report.series import display, thin
 from haltere.report.style import AXES, SENSOR_COLOURS
 
@@ -24,7 +24,7 @@ def track(c: Context) -> Section:
     """The flight from above in metres, north up."""
     section = Section("map", "Map")
     if "pos_n" not in c.solution:
-        section.note = f"Not drawn: {c.solution.config.estimator} estimates attitude only, and no position."
+        section.note = f"Not drawn: {c.solution.config.estimator} estimates attitude only, so there is no map, no velocity and no position."
         return section
     if not c.held_by_measurement:
         section.note = "Not drawn: no GNSS position was let in, so where the vehicle flew is not known."
@@ -44,7 +44,7 @@ def track(c: Context) -> Section:
             shown = display(t, [p[:, 0], p[:, 1], p[:, 2]], 2 * c.pool.points)
         ids = [c.pool.add(shown[0], 1e-4), *(c.pool.add(s) for s in shown[1:])]
         points.append((p[:, 0], p[:, 1]))
-        look = {"marker": {"size": 4, "color": f"@{colour}"}} if dots else {"line": {"width": 2.2 if colour == "estimate" else 1.2, "color": f"@{colour}"}}
+        look = {"marker": {"size": 4, "color": f"@{colour}"}} if dots else {"line": pen(colour, 2.2 if colour == "estimate" else 1.2)}
         traces.append({
             "type": "scatter", "name": label, "x": {"$a": ids[2]}, "y": {"$a": ids[1]}, "customdata": {"$zip": [ids[0], ids[3]]},
             "mode": "markers" if dots else "lines", **look,
@@ -69,12 +69,12 @@ def track(c: Context) -> Section:
     middle, half = _frame(points)
     axis = {**AXES, "zeroline": True, "nticks": 8}
     layout = {
-        "margin": {"l": LEFT, "r": 12, "t": 6, "b": FOOT}, "hovermode": "closest",
+        "margin": {"l": LEFT, "r": 12, "t": TOP, "b": FOOT}, "hovermode": "closest",
         "xaxis": {**axis, "title": {"text": "east [m]", "standoff": 4}, "range": [middle[1] - half, middle[1] + half], "constrain": "domain"},
         "yaxis": {**axis, "title": {"text": "north [m]", "standoff": 6}, "range": [middle[0] - half, middle[0] + half], "scaleanchor": "x",
                   "constrain": "domain"},
     }  # fmt: skip
-    section.figures.append({"name": "map", "traces": traces, "layout": layout, "height": 440, "time": False})
+    section.figures.append({"name": "map", "traces": traces, "layout": layout, "height": 470, "time": False})
     return section
 
 
@@ -137,9 +137,9 @@ def timeline(c: Context) -> Section:
             "text": [plain(f"{sensor_label(e['sensor'])}: {e['kind']}. {e.get('evidence') or ''}") for e in happened],
         })  # fmt: skip
     n = len(labels)
-    height = 26 * n + 16 + FOOT
+    height = 26 * n + 16 + FOOT + TOP
     layout = {
-        "margin": {"l": LEFT, "r": 12, "t": 6, "b": FOOT}, "hovermode": "closest",
+        "margin": {"l": LEFT, "r": 12, "t": TOP, "b": FOOT}, "hovermode": "closest",
         "xaxis": {**AXES, "range": list(c.span), "title": {"text": "t [s]", "standoff": 4}, "hoverformat": ".3f"},
         "yaxis": {**AXES, "range": [n - 0.4, -0.6], "tickvals": list(range(n)), "ticktext": [plain(x) for x in labels], "showgrid": False,
                   "automargin": True, "fixedrange": True, "ticks": ""},
@@ -152,7 +152,9 @@ def _why(reasons: tuple[str, ...]) -> str:
     return f" ({', '.join(reasons)})" if reasons else ""
 
 
-def _bars(c: Context, row: int, starts: FloatArray, ends: FloatArray, colour: str, text: list[str], label: str, width: int, legend: bool) -> dict[str, Any]:
+def _bars(
+    c: Context, row: int, starts: FloatArray, ends: FloatArray, colour: str, text: list[str], label: str, width: int, legend: bool
+) -> dict[str, Any]:
     """Horizontal bars in one trace; the shortest are wide enough to be seen."""
     least = 0.002 * (c.span[1] - c.span[0])
     x: list[float | None] = []

@@ -78,7 +78,7 @@ def _assemble(c: Context, command: str | None) -> str:
             '<!DOCTYPE html>\n<html lang="en">\n<head>\n<meta charset="utf-8">',
             # The page may run its own scripts and nothing else; even a fault in it cannot reach the network.
             "<meta http-equiv=\"Content-Security-Policy\" content=\"default-src 'none'; script-src 'unsafe-inline'; style-src 'unsafe-inline'; "
-            "img-src data: blob:; font-src data:\">",
+            'img-src data: blob:; font-src data:">',
             '<meta name="viewport" content="width=device-width, initial-scale=1">',
             f'<meta name="generator" content="haltere {escape(__version__)}">',
             f"<title>{escape(name)} – haltere</title>",
@@ -122,7 +122,9 @@ def _section(section: Section, figures: list[Figure]) -> str:
     for figure in section.figures:
         if "title" in figure:
             out.append(f"<h3>{escape(figure['title'])}</h3>")
-        out.append(f'<div class="figure" id="figure-{escape(figure["name"])}" data-figure="{len(figures)}" style="height:{figure["height"] + 30}px"></div>')
+        out.append(
+            f'<div class="figure" id="figure-{escape(figure["name"])}" data-figure="{len(figures)}" style="height:{figure["height"]}px"></div>'
+        )
         figures.append(figure)
     out.append(f"{section.after}</section>")
     return "\n".join(out)

@@ -12,18 +12,23 @@ from numpy.typing import NDArray
 from haltere.report.series import Pool, display
 from haltere.report.style import AXES
 
-__all__ = ["FOOT", "LEFT", "Figure", "Panels", "plain"]
+__all__ = ["FOOT", "LEFT", "TOP", "Figure", "Panels", "pen", "plain"]
 
 FloatArray = NDArray[np.float64]
 Figure = dict[str, Any]
 
-#: Pixels of one panel, between panels, below and left of them; markers shown at most a series.
-ROW, GAP, FOOT, LEFT, MARKERS = 150, 14, 44, 74, 300
+#: Pixels of one panel, between panels, below, left and above them; markers shown at most a series.
+ROW, GAP, FOOT, LEFT, TOP, MARKERS = 150, 14, 44, 74, 30, 300
 
 
 def plain(text: object) -> str:
     """Text of a log for plotly, which reads some tags in text."""
     return html.escape(str(text), quote=False)
+
+
+def pen(colour: str, width: float) -> dict[str, Any]:
+    """Style of a line; truth is dashed, since a good estimate lies exactly under it."""
+    return {"color": f"@{colour}", "width": width} | ({"dash": "6px,5px"} if colour == "truth" else {})
 
 
 class Panels:
@@ -61,15 +66,28 @@ class Panels:
         first = legend and label not in self._named
         if first:
             self._named.add(label)
-        self.traces.append({"type": "scatter", "name": plain(label), "legendgroup": plain(label), "showlegend": first, **self._axes(row), **rest})
+        self.traces.append(
+            {"type": "scatter", "name": plain(label), "legendgroup": plain(label), "showlegend": first, **self._axes(row), **rest}
+        )
 
     def _widen(self, row: int, low: float, high: float) -> None:
         if math.isfinite(low) and math.isfinite(high):
             self.extent[row] = (min(self.extent[row][0], low), max(self.extent[row][1], high))
 
     def line(
-        self, row: int, label: str, colour: str, t: FloatArray, y: FloatArray, sd: FloatArray | None = None, *, unit: str = "",
-        resolution: float = 1e-3, period: float | None = None, width: float = 1.9, centred: bool = False, sigmas: str = "1σ",
+        self,
+        row: int,
+        label: str,
+        colour: str,
+        t: FloatArray,
+        y: FloatArray,
+        sd: FloatArray | None = None,
+        *,
+        unit: str = "",
+        resolution: float = 1e-3,
+        period: float | None = None,
+        width: float = 1.9,
+        centred: bool = False,
     ) -> None:
         """A line, with its band of one standard deviation where ``sd`` is given: about the line, or about zero (``centred``)."""
         columns = [y] if sd is None else [y, sd]
@@ -84,13 +102,13 @@ class Panels:
             known = shown[2][np.isfinite(shown[2])]
             reach = 1.5 * float(np.median(known)) if len(known) else 0.0
             band = {"t": ids[0], "y": None if centred else ids[1], "sd": ids[2]}
-            self._trace(row, f"{label} ±{sigmas}" if not centred else f"±{sigmas}", **{"$band": band}, mode="lines", fill="toself", hoverinfo="skip",
-                        fillcolor=f"@{'limit' if centred else colour}/0.22", line={"width": 0})  # fmt: skip
+            self._trace(row, "±1σ" if centred else f"{label} ±1σ", **{"$band": band}, mode="lines", fill="toself", hoverinfo="skip",
+                        fillcolor=f"@{'limit' if centred else colour}/{0.3 if centred else 0.22}", line={"width": 0})  # fmt: skip
         low, high = float(finite.min()), float(finite.max())
         self._widen(row, *((min(low, -reach), max(high, reach)) if centred else (low - reach, high + reach)))
         few = len(finite) <= 60
         trace: dict[str, Any] = {
-            "x": {"$a": ids[0]}, "y": {"$a": ids[1]}, "mode": "lines+markers" if few else "lines", "line": {"color": f"@{colour}", "width": width},
+            "x": {"$a": ids[0]}, "y": {"$a": ids[1]}, "mode": "lines+markers" if few else "lines", "line": pen(colour, width),
             "hovertemplate": f"%{{y:.4~g}}{' ± %{customdata:.2~g}' if sd is not None else ''} {unit}",
         }  # fmt: skip
         if few:
@@ -111,8 +129,19 @@ class Panels:
                         line={"color": f"@{colour}", "width": 1, "dash": "dot"})  # fmt: skip
 
     def markers(
-        self, row: int, label: str, colour: str, t: FloatArray, y: FloatArray, *, symbol: str = "x", size: int = 7, texts: list[str] | None = None,
-        unit: str = "", resolution: float = 1e-3, widen: bool = True,
+        self,
+        row: int,
+        label: str,
+        colour: str,
+        t: FloatArray,
+        y: FloatArray,
+        *,
+        symbol: str = "x",
+        size: int = 7,
+        texts: list[str] | None = None,
+        unit: str = "",
+        resolution: float = 1e-3,
+        widen: bool = True,
     ) -> None:
         """Marked points, at most `MARKERS` of them with the extremes among them."""
         from haltere.report.series import thin
@@ -141,15 +170,15 @@ class Panels:
 
     @property
     def height(self) -> int:
-        """Pixels of the panels and the time axis, without the legend."""
+        """Pixels of the panels, the time axis and a line of legend."""
         n = len(self.titles)
-        return n * self.row + (n - 1) * GAP + FOOT
+        return n * self.row + (n - 1) * GAP + FOOT + TOP
 
     def figure(self) -> Figure:
         """The figure: name, traces, layout, height and that its x axis is time."""
         n = len(self.titles)
         inner = n * self.row + (n - 1) * GAP
-        layout: dict[str, Any] = {"shapes": self.shapes, "margin": {"l": LEFT, "r": 12, "t": 6, "b": FOOT}}
+        layout: dict[str, Any] = {"shapes": self.shapes, "margin": {"l": LEFT, "r": 12, "t": TOP, "b": FOOT}}
         for k, title in enumerate(self.titles):
             top = 1.0 - k * (self.row + GAP) / inner
             number = "" if k == 0 else str(k + 1)
@@ -163,7 +192,14 @@ class Panels:
                 y["range"] = [low - margin, high + margin]
                 if k in self.reversed:
                     y["range"].reverse()
-            x: dict[str, Any] = {**AXES, "anchor": f"y{number}", "range": list(self.span), "hoverformat": ".3f", "showticklabels": k == n - 1}
+            x: dict[str, Any] = {
+                **AXES,
+                "anchor": f"y{number}",
+                "range": list(self.span),
+                "hoverformat": ".3f",
+                "unifiedhovertitle": {"text": "t = %{x:.3f} s"},
+                "showticklabels": k == n - 1,
+            }
             if k:
                 x["matches"] = "x"
             if k == n - 1:

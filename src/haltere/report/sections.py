@@ -44,10 +44,10 @@ def attitude(c: Context) -> Section:
     return Section("attitude", "Attitude", "Roll right side down, pitch nose up, yaw from true north towards east.", [panels.figure()])
 
 
-def velocity(c: Context) -> Section:
+def velocity(c: Context) -> Section | None:
     """Velocity NED with 1σ, over GNSS, truth and onboard."""
     if "vel_n" not in c.solution:
-        return Section("velocity", "Velocity", f"Not drawn: {c.solution.config.estimator} estimates attitude only.")
+        return None
     panels = _panels(c, "velocity", [f"{WORDS[a]} [m/s]" for a in "ned"])
     panels.reversed = {2}
     for k, a in enumerate("ned"):
@@ -56,13 +56,18 @@ def velocity(c: Context) -> Section:
         panels.line(k, "estimate", "estimate", c.solution.t, c.solution[f"vel_{a}"], _sd(c, f"sd_vel_{a}"), unit="m/s")
         for name, stream in c.references:
             panels.line(k, name, name, stream.t, stream.get(f"vel_{a}"), unit="m/s", width=1.0)
-    return Section("velocity", "Velocity", "Over ground, north, east and down; the axis of down points down, so that climbing goes up.", [panels.figure()])
+    return Section(
+        "velocity",
+        "Velocity",
+        "Over ground, north, east and down; the axis of down points down, so that climbing goes up.",
+        [panels.figure()],
+    )
 
 
-def position(c: Context) -> Section:
+def position(c: Context) -> Section | None:
     """Position NED with 1σ, over GNSS, barometer, truth and onboard."""
     if "pos_n" not in c.solution:
-        return Section("position", "Position", f"Not drawn: {c.solution.config.estimator} estimates attitude only.")
+        return None
     note = "From the origin, north, east and down; the axis of down points down."
     if not c.held_by_measurement:
         note += " <strong>No GNSS position was let in: the position is dead reckoning held near the start by an assumption, not measured.</strong>"
@@ -89,14 +94,14 @@ def _barometer(c: Context, panels: Panels, row: int) -> None:
         panels.line(row, "barometer less its offset", "barometer", t, offset - c.solution.aids["observation"][rows], unit="m", width=1.0)
 
 
-def biases(c: Context) -> Section:
+def biases(c: Context) -> Section | None:
     """Biases of gyro, accelerometer and barometer with 1σ."""
     groups = [(f"gyro_bias_{a}", f"gyro {a} [deg/s]", "deg/s", DEG, 1e-4) for a in "xyz"]
     groups += [(f"accel_bias_{a}", f"accel. {a} [m/s²]", "m/s²", 1.0, 1e-4) for a in "xyz"]
     groups += [("baro_bias", "barometer [m]", "m", 1.0, 1e-3)]
     groups = [g for g in groups if g[0] in c.solution]
     if not groups:
-        return Section("biases", "Biases")
+        return None
     panels = _panels(c, "biases", [g[1] for g in groups], 112)
     for k, (name, _, unit, factor, resolution) in enumerate(groups):
         y = factor * c.solution[name]
@@ -128,18 +133,23 @@ def errors(c: Context) -> Section | None:
     names = [n for n in ("roll", "pitch", "yaw", "vel_n", "vel_e", "vel_d", "pos_n", "pos_e", "pos_d") if n in series]
     if not names:
         return None
-    titles = [f"{COMPONENTS[n][0]} [{COMPONENTS[n][1]}]" if n in COMPONENTS else f"{n} [deg]" for n in names]
-    panels = _panels(c, "errors", titles, 112)
-    for k, name in enumerate(names):
-        factor, unit = (DEG, "deg") if "_" not in name else (1.0, "m/s" if name.startswith("vel") else "m")
-        t, e = series[name]
-        sd = _sd(c, f"sd_{name}", factor)
-        at = None if sd is None else np.interp(t, c.solution.t, sd)
-        panels.line(k, "estimate less truth", "estimate", t, factor * e, at, unit=unit, centred=True)
-        if at is not None:
-            panels.limits(k, "±3σ", t, 3.0 * at)
+    figures = []
+    for group, title in (("", "attitude"), ("vel", "velocity"), ("pos", "position")):
+        mine = [n for n in names if n.rpartition("_")[0] == group]
+        if not mine:
+            continue
+        units = [(n, "deg", DEG) if not group else COMPONENTS[n][:3] for n in mine]
+        panels = _panels(c, f"errors_{title}", [f"{label} [{unit}]" for label, unit, _ in units], 112)
+        for k, (name, (_, unit, factor)) in enumerate(zip(mine, units, strict=True)):
+            t, e = series[name]
+            sd = _sd(c, f"sd_{name}", factor)
+            at = None if sd is None else np.interp(t, c.solution.t, sd)
+            panels.line(k, "estimate less truth", "estimate", t, factor * e, at, unit=unit, centred=True)
+            if at is not None:
+                panels.limits(k, "±3σ", t, 3.0 * at)
+        figures.append({**panels.figure(), "title": title})
     note = "The band is what the filter states: two thirds of the time the error should lie inside, and almost always between the dotted lines."
-    return Section("errors", "Errors against truth", note, [panels.figure()])
+    return Section("errors", "Errors against truth", note, figures)
 
 
 def innovations(c: Context) -> Section:
@@ -178,7 +188,9 @@ def _innovation(c: Context, panels: Panels, row: int, sensor: str, component: st
     key = f"gate.{sensor}"
     gate = c.solution.config.number(key) if key in KEYS else 3.0
     label = f"gate ±{gate:g}σ" if key in KEYS else "±3σ (no gate)"
-    panels.line(row, "innovation", SENSOR_COLOURS.get(sensor, "assumed"), t, e, sd, unit=unit, resolution=resolution, width=1.0, centred=True)
+    panels.line(
+        row, "innovation", SENSOR_COLOURS.get(sensor, "assumed"), t, e, sd, unit=unit, resolution=resolution, width=1.0, centred=True
+    )
     panels.limits(row, label, t, gate * sd, resolution=resolution)
     bound = 1.1 * gate * float(np.median(sd))
     passed = np.abs(e[status != "rejected"])
@@ -187,7 +199,11 @@ def _innovation(c: Context, panels: Panels, row: int, sensor: str, component: st
     reach = max(float(passed.max(initial=0.0)), min(float(refused.max(initial=0.0)), 4.0 * bound))
     reach = max(reach, min(bound, 6.0 * float(np.quantile(np.abs(e), 0.95))), float(np.median(sd)) * 1.3)
     panels.extent[row] = (-reach, reach)
-    for word, name, colour, symbol in (("deweighted", "de-weighted", "deweighted", "diamond"), ("rejected", "refused", "refused", "x"), ("held", "held", "deweighted", "circle-open")):
+    for word, name, colour, symbol in (
+        ("deweighted", "de-weighted", "deweighted", "diamond"),
+        ("rejected", "refused", "refused", "x"),
+        ("held", "held", "deweighted", "circle-open"),
+    ):
         mine = status == word
         if mine.any():
             panels.markers(row, name, colour, t[mine], e[mine], symbol=symbol, texts=[f"{name}: {r}" if r else name for r in reason[mine].tolist()],

@@ -5,6 +5,7 @@ from __future__ import annotations
 import html
 import math
 from collections.abc import Iterable, Sequence
+from typing import Any
 
 from haltere.flight.config import KEYS, Value, defaults
 from haltere.flight.schema import base_name
@@ -61,12 +62,13 @@ def consistency(c: Context) -> Section:
     """NIS and NEES against their χ² bands, in a table and in words."""
     summary = c.solution.summary
     section = Section("consistency", "Is the stated uncertainty true?")
+    nis = summary.get("nis", {})
     rows = [
         (
             escape(sensor_label(sensor)), f"{v['n']:,}", number(v["mean"]), f"{number(v['band'][0])} … {number(v['band'][1])}", f"{v['rejected']:,}",
             f"{v['deweighted']:,}", escape(nis_in_words(v["mean"], v["band"])),
         )
-        for sensor, v in summary.get("nis", {}).items()
+        for sensor, v in ((s, nis[s]) for s in c.sensors if s in nis)
     ]  # fmt: skip
     if rows:
         section.after += table(("sensor", "tested", "mean NIS", "95 % band", "refused", "de-weighted", "reading "), rows,
@@ -78,7 +80,7 @@ def consistency(c: Context) -> Section:
     if rows:
         section.after += table(("block", "mean NEES", "95 % band", "degrees of freedom"), rows,
                                caption="squared errors over their stated variance a degree of freedom (NEES), against truth; 1 is ideal")  # fmt: skip
-    elif summary.get("nis"):
+    elif nis:
         section.after += "<p>No NEES: it needs a truth, and this flight has none.</p>"
     section.after += errors_table(c)
     if not section.after:
@@ -106,16 +108,30 @@ def data(c: Context) -> Section:
         mean = (facts["n"] - 1) / length if length > 0.0 else None
         compared = base_name(name) in ("onboard", "truth")
         note = "compared with, never read by the estimator" if compared else "" if base_name(name) == name else "further unit, not used"
-        rows.append((escape(name), f"{facts['n']:,}", "–" if compared else number(facts["rate"]), number(mean), "–" if compared else f"{facts['gaps']}", note))
+        rows.append(
+            (
+                escape(name),
+                f"{facts['n']:,}",
+                "–" if compared else number(facts["rate"]),
+                number(mean),
+                "–" if compared else f"{facts['gaps']}",
+                note,
+            )
+        )
     section.after += table(("stream", "samples", "rate [Hz]", "mean [Hz]", "gaps", "note "), rows, caption="streams of the log")
     return section
+
+
+def _time(event: dict[str, Any]) -> str:
+    t = event.get("t_onset") if event.get("t_onset") is not None else event.get("t_detected")
+    return "–" if t is None else f"{t:.3f}"
 
 
 def events(c: Context) -> str:
     """Events, and stretches of refused measurements, as tables."""
     rows = [
         (
-            number(e.get("t_onset"), 6), escape(sensor_label(e["sensor"])) + (f" {escape(e['axis'])}" if e.get("axis") not in (None, "") else ""),
+            _time(e), escape(sensor_label(e["sensor"])) + (f" {escape(e['axis'])}" if e.get("axis") not in (None, "") else ""),
             escape(e["kind"]), escape(e.get("evidence") or ""),
         )
         for e in c.solution.events[:ROWS]
@@ -157,7 +173,7 @@ def configuration(c: Context, command: str | None) -> Section:
     heads = ("key", "value", "unit ", "default", "meaning ")
     if changed:
         section.after += table(heads, [r for r, _ in changed], [m for _, m in changed], caption="keys that are not at their default")
-        section.after += '<p>Shaded strongly: set by the user or the log. Shaded lightly: no default, taken from the data or a model.</p>'
+        section.after += "<p>Shaded strongly: set by the user or the log. Shaded lightly: no default, taken from the data or a model.</p>"
     else:
         section.after += "<p>Every key is at its default.</p>"
     section.after += f"<details><summary>all {len(rows)} keys</summary>{table(heads, rows, marks)}</details>"

@@ -8,9 +8,12 @@ from typing import Any
 
 import numpy as np
 
+from haltere.flight.log import FlightLog
+from haltere.flight.solution import Solution
 from haltere.report.context import Context, Episode, sensor_label
+from haltere.report.series import Pool
 
-__all__ = ["Verdict", "count", "discarded", "facts", "nis_in_words", "number", "verdict"]
+__all__ = ["Verdict", "count", "discarded", "facts", "nis_in_words", "number", "verdict", "verdict_of"]
 
 #: Share of a stream's samples above which a discard is worth a word in the verdict.
 WORTH_TELLING = 0.01
@@ -55,6 +58,11 @@ def discarded(summary: dict[str, Any]) -> list[tuple[str, str, int, int]]:
     ]
 
 
+def verdict_of(solution: Solution, flight: FlightLog) -> Verdict:
+    """The verdict on a solution, for those who draw nothing."""
+    return verdict(Context(solution, flight, Pool(1)))
+
+
 def verdict(c: Context) -> Verdict:
     """What a reader wants to know first."""
     summary, solution = c.solution.summary, c.solution
@@ -62,16 +70,22 @@ def verdict(c: Context) -> Verdict:
     levels = {"good": 0, "doubtful": 1, "bad": 2}
     by_level = {word: [s for s, h in health.items() if h.get("verdict") == word] for word in levels}
     broken = [e for e in solution.events if e["kind"] == "diverged"]
-    lost = [d for d in discarded(summary) if d[2] > 0.05 * max(d[3], 1) and d[1] != "before alignment"]
-    worst = 2 if by_level["bad"] or broken else 1 if by_level["doubtful"] or lost else 0
+    lost = [d for d in discarded(summary) if d[2] > 0.05 * max(d[3], 1) and d[1] not in ("before alignment", "no 3-D fix")]
+    drifting = "pos_n" in solution and not c.held_by_measurement
+    worst = 2 if by_level["bad"] or broken else 1 if by_level["doubtful"] or lost or drifting else 0
     if broken:
         headline = f"The filter broke down {count(len(broken), 'time')}: read what follows with that in mind."
-    elif worst:
+    elif by_level["bad"] or by_level["doubtful"]:
         named = [sensor_label(s) for s in (*by_level["bad"], *by_level["doubtful"])]
-        headline = f"Not all data fit: {_list(named)} {'disagree' if len(named) > 1 else 'disagrees'} with the rest." if named else \
-            "The sensors agree, but a good part of the data could not be used."  # fmt: skip
-    elif by_level["good"]:
+        headline = f"Not all sensors fit: {_list(named)} {'disagree' if len(named) > 1 else 'disagrees'} with the rest."
+    elif drifting:
+        headline = "Rely on attitude only: no GNSS position was let in, so velocity and position are held by assumptions."
+    elif worst:
+        headline = "The sensors agree, but a good part of the data could not be used."
+    elif len(by_level["good"]) > 1:
         headline = f"The sensors agree with each other: {_list([sensor_label(s) for s in by_level['good']])}."
+    elif by_level["good"]:
+        headline = f"The {sensor_label(by_level['good'][0])} agrees with the inertial sensors."
     else:
         headline = "Nothing but the inertial sensors was used, so nothing confirms the solution."
         worst = 1
@@ -113,7 +127,7 @@ def episode_in_words(e: Episode) -> str:
 
 def _what_happened(c: Context) -> list[str]:
     out = []
-    noted = [e for e in c.solution.events if e["kind"] not in ("aligned", "reset")]
+    noted = [e for e in c.solution.events if e["kind"] != "aligned" and not str(e.get("evidence")).startswith("first measurement")]
     for e in noted[:4]:
         when = e.get("t_onset") if e.get("t_onset") is not None else e.get("t_detected")
         at = f"At t = {when:.1f} s" if when is not None else "At some time"
@@ -121,12 +135,13 @@ def _what_happened(c: Context) -> list[str]:
     if len(noted) > 4:
         out.append(f"{count(len(noted) - 4, 'further event')} in the table below.")
     sensors = [e for e in c.episodes if not e.sensor.startswith(("zero", "fake"))]
-    largest = sorted(sorted(sensors, key=lambda e: -e.n)[:3], key=lambda e: e.start)
+    largest = sorted(sorted((e for e in sensors if e.n > 2), key=lambda e: -e.n)[:3], key=lambda e: e.start)
     for e in largest:
         words = episode_in_words(e)
         out.append(f"{words[:1].upper()}{words[1:]}.")
-    if len(sensors) > len(largest):
-        out.append(f"{len(sensors) - len(largest)} smaller stretches of refused measurements are listed below.")
+    rest = sum(e.n for e in sensors) - sum(e.n for e in largest)
+    if rest:
+        out.append(f"{count(rest, 'further measurement' if largest else 'measurement')} refused or de-weighted, listed below.")
     i = int(np.argmax(c.tilt))
     if c.tilt[i] > 60.0:
         first = int(np.argmax(c.tilt > 60.0))
@@ -146,9 +161,17 @@ def _quality(c: Context) -> list[str]:
             if axes:
                 parts.append(f"{word} {' / '.join(fixed(v) for v in axes)} {unit}")
         if parts:
-            what = "RMS error against truth (north / east / down)" if name == "truth" else f"RMS difference from the {name} solution (north / east / down; it is another estimate, no truth)"
+            what = (
+                "RMS error against truth (north / east / down)"
+                if name == "truth"
+                else f"RMS difference from the {name} solution (north / east / down; it is another estimate, no truth)"
+            )
             out.append(f"{what}: {'; '.join(parts)}.")
-    sd = {k: float(np.median(c.solution[f"sd_{k}"])) for k in ("roll", "pitch", "yaw", "vel_n", "vel_e", "vel_d", "pos_n", "pos_e", "pos_d") if f"sd_{k}" in c.solution}
+    sd = {
+        k: float(np.median(c.solution[f"sd_{k}"]))
+        for k in ("roll", "pitch", "yaw", "vel_n", "vel_e", "vel_d", "pos_n", "pos_e", "pos_d")
+        if f"sd_{k}" in c.solution
+    }
     parts = [f"{k} {fixed(math.degrees(sd[k]))}°" for k in ("roll", "pitch", "yaw") if k in sd]
     for stem, word, unit in (("vel", "velocity", "m/s"), ("pos", "position", "m")):
         if f"{stem}_n" in sd:
@@ -162,7 +185,9 @@ def _left_out(summary: dict[str, Any]) -> list[str]:
     if not lost:
         return ["No sample was discarded."]
     large = [d for d in lost if d[2] > WORTH_TELLING * max(d[3], 1)]
-    told = "; ".join(f"{count(n, 'sample')} of {stream} ({reason}, {100.0 * n / max(size, 1):.0f} % of it)" for stream, reason, n, size in large[:4])
+    told = "; ".join(
+        f"{count(n, 'sample')} of {stream} ({reason}, {100.0 * n / max(size, 1):.0f} % of it)" for stream, reason, n, size in large[:4]
+    )
     rest = sum(n for _, _, n, _ in lost) - sum(d[2] for d in large[:4])
     if not told:
         return [f"{count(rest, 'sample')} discarded, less than one in a hundred of any stream; the table below says why."]
@@ -209,8 +234,8 @@ def facts(c: Context) -> list[tuple[str, str]]:
         k = int(np.argmax(ground))
         add("fastest", f"{ground[k]:.1f} m/s over ground at t = {solution.t[k]:.1f} s")
         way = float(np.sum(0.5 * (ground[1:] + ground[:-1]) * np.minimum(np.diff(solution.t), 1.0)))
-        height = -solution["pos_d"]
-        add("track", f"{way:.0f} m long; height {height.min():.1f} to {height.max():.1f} m from the origin")
+        low, high = -float(solution["pos_d"].max()), -float(solution["pos_d"].min())
+        add("track", f"{way:.0f} m long; height {low:z.1f} to {high:z.1f} m from the origin")
     for fault in meta.faults:
         add("injected fault", ", ".join(f"{k} {v}" for k, v in fault.items()))
     timings = summary.get("timings", {})

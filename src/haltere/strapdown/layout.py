@@ -189,6 +189,7 @@ def layout(baro: int = 0) -> np.dtype[np.void]:
             ("n_aligned", "i8"),
             ("t_aligned", "f8"),
             ("t_newest", "f8"),
+            ("t_wake", "f8"),  # nothing is to be fused before this time
             ("t_covariance", "f8"),
             ("n_steps", "i8"),
             ("n_unaligned", "i8"),

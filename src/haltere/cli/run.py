@@ -1,0 +1,130 @@
+"""`haltere run LOG`: the main job, from a log to a folder with solution and report. It computes nothing itself."""
+
+from __future__ import annotations
+
+import json as json_
+import shlex
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from haltere.cli.progress import Progress
+
+if TYPE_CHECKING:
+    from haltere.flight.log import FlightLog
+    from haltere.flight.solution import Solution
+
+__all__ = ["default_folder", "finish", "run"]
+
+
+def default_folder(log: Path) -> Path:
+    """Where a run is written when nothing else is said: ``./<log stem>.haltere``."""
+    log = Path(log)
+    named = log if log.stem not in ("", "..") else log.resolve()
+    return Path(f"{named.stem or 'flight'}.haltere")
+
+
+def run(
+    log: Path,
+    *,
+    estimator: str | None = None,
+    preset: str | None = None,
+    config: Path | None = None,
+    assignments: list[str] | None = None,
+    smooth: bool = False,
+    vehicle: Path | None = None,
+    out: Path | None = None,
+    rate: float | None = None,
+    json: bool = False,
+    show: bool = False,
+) -> None:
+    """Estimate a flight and write its folder.
+
+    Parameters
+    ----------
+    log
+        A log or flight folder.
+
+    Other Parameters
+    ----------------
+    estimator, preset
+        Names; what is not given is taken from the configuration file, else ``navigator`` and ``default``.
+    config
+        Configuration file.
+    assignments
+        ``key=value`` texts, over everything else.
+    smooth, vehicle, rate
+        As of `haltere.run`.
+    out
+        Folder to write; default `default_folder`.
+    json
+        Print only the summary, as JSON.
+    show
+        Open the report in the browser.
+
+    Raises
+    ------
+    HaltereError
+        The log cannot be read or navigated on, or the folder not be written.
+    UsageError
+        Unknown estimator, preset or key, or a value out of bounds.
+    """
+    from haltere.flight import config as configuration
+
+    # Wrong usage is found before the log is read.
+    named: tuple[str | None, str | None] = (None, None)
+    keys: dict[str, Any] = {}
+    if config is not None:
+        *named_, keys = configuration.load(config)
+        named = (named_[0], named_[1])
+    estimator, preset = estimator or named[0] or "navigator", preset or named[1] or "default"
+    changes = dict(configuration.parse_assignment(text) for text in assignments or [])
+    configuration.resolve(estimator, preset, keys, str(config))
+    configuration.resolve(estimator, preset, changes, "--set")
+
+    folder = Path(out) if out is not None else default_folder(log)
+    with Progress() as progress:
+        progress.stage("reading the log")
+        from haltere.readers import read
+
+        flight = read(log)
+        progress.stage(estimator, compiles=True)
+        from haltere import drive
+
+        solution = drive.run(
+            flight, estimator, preset=preset, config=keys, set=changes, vehicle=vehicle, smooth=smooth, rate=rate, progress=progress.update
+        )
+        again = [
+            "haltere",
+            "run",
+            str(log),
+            "--config",
+            str(folder / "config.toml"),
+            *(["--rate", f"{rate:g}"] if rate is not None else []),
+        ]
+        finish(solution, flight, folder, shlex.join(again), progress)
+    told(solution, flight, folder, json=json, show=show)
+
+
+def finish(solution: Solution, flight: FlightLog, folder: Path, command: str, progress: Progress) -> None:
+    """Draw the report and write everything."""
+    progress.stage("drawing the report")
+    from haltere.report import page
+
+    text = page(solution, flight, command)
+    progress.stage("writing")
+    solution.save(folder, extra={"report.html": text})
+
+
+def told(solution: Solution, flight: FlightLog, folder: Path, *, json: bool, show: bool) -> None:
+    """Print what came out, and open the report where asked."""
+    from haltere.cli.told import losses, lines
+
+    losses(solution.summary)
+    if json:
+        print(json_.dumps(solution.summary, indent=1, allow_nan=False, ensure_ascii=False))
+    else:
+        print("\n".join(lines(solution, flight, folder)))
+    if show:
+        import webbrowser
+
+        webbrowser.open((folder / "report.html").resolve().as_uri())
