@@ -149,13 +149,11 @@ def _loop(
         _drain(S, aids, parts, events)
 
     i = j = 0
-    while i < len(t):
+    while i < len(t) or S["imu_n"][0] > 0:
         i, j = kernels.run_chunk(S, prm, t, gyro, accel, i, min(i + CHUNK, len(t)), m.kind, m.t, m.z, m.r, j, chunk, cov, aids)
         drain()
         if progress is not None:
             progress(i / len(t))
-    kernels.flush(S, prm, chunk, cov, aids)
-    drain()
     return columns[:, :filled], parts, events
 
 

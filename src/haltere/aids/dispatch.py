@@ -71,7 +71,7 @@ def due(s: Any, prm: Any, sensor: int, w: Vec, f: Vec) -> bool:
 @jit
 def fuse_all(s: Any, prm: Any, aids: Any, dt: float, w: Vec, f: Vec) -> None:
     """Fuse every queued measurement valid at or before the state's time, sensor by sensor, then the pseudo-measurements due."""
-    sensor = 0
+    sensor = GNSS_VELOCITY
     while sensor < N_SENSORS:
         i, t = 0, s.t
         if sensor < N_QUEUED:

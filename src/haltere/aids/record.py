@@ -16,6 +16,8 @@ GNSS_VELOCITY, GNSS_POSITION, BAROMETER, MAGNETOMETER, ZERO_VELOCITY, ZERO_RATE,
     constant(i) for i in range(9)
 )
 N_QUEUED = 4
+#: Sensor of an event that no sensor made.
+NO_SENSOR = constant(0)
 SENSORS = ("gnss", "gnss", "barometer", "magnetometer", "zero_velocity", "zero_rate", "fake_position", "fake_velocity", "gnss")
 
 COMPONENTS = (

@@ -42,7 +42,11 @@ def _common(
     pass
 
 
-@app.command("run", help="Estimate a flight from its log; write solution, summary, configuration and report to a folder.")
+@app.command(
+    "run",
+    short_help="Navigate a log; write solution and report.",
+    help="Estimate a flight from its log; write solution, summary, configuration and report to a folder.",
+)
 def _run(
     log: Log,
     estimator: Annotated[
@@ -79,7 +83,11 @@ def _run(
     )  # fmt: skip
 
 
-@app.command("demo", help="Simulate a flight, navigate it and write its report: no input, no network.")
+@app.command(
+    "demo",
+    short_help="Simulate a flight, navigate it, report.",
+    help="Simulate a flight, navigate it and write its report: no input, no network.",
+)
 def _demo(
     out: Annotated[Path, typer.Option("--out", metavar="DIR", help="Folder to write.")] = Path("demo.haltere"),
     seed: Annotated[int, typer.Option("--seed", metavar="N", min=0, help="Of everything random in the flight.")] = 1,
@@ -91,14 +99,20 @@ def _demo(
     demo(out, seed=seed, json=json, show=open_)
 
 
-@app.command("info", help="Say what is in a log, what each estimator can do with it, and which logging setting would help.")
+@app.command(
+    "info",
+    short_help="What a log holds and supports.",
+    help="Say what is in a log, what each estimator can do with it, and which logging setting would help.",
+)
 def _info(log: Log, json: Json = False) -> None:
     from haltere.cli.info import info
 
     info(log, json=json)
 
 
-@app.command("convert", help="Write a log as a flight folder: one table a sensor, SI units, NED and FRD.")
+@app.command(
+    "convert", short_help="Any log to a flight folder.", help="Write a log as a flight folder: one table a sensor, SI units, NED and FRD."
+)
 def _convert(
     log: Log,
     out: Annotated[Path, typer.Argument(metavar="DIR", help="The folder to write.", show_default=False)],

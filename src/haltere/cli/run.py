@@ -117,7 +117,7 @@ def finish(solution: Solution, flight: FlightLog, folder: Path, command: str, pr
 
 def told(solution: Solution, flight: FlightLog, folder: Path, *, json: bool, show: bool) -> None:
     """Print what came out, and open the report where asked."""
-    from haltere.cli.told import losses, lines
+    from haltere.cli.told import lines, losses
 
     losses(solution.summary)
     if json:

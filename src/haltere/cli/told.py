@@ -35,7 +35,8 @@ def lines(solution: Solution, flight: FlightLog, folder: Path) -> list[str]:
     said = verdict_of(solution, flight)
     out = [
         f"{summary['name'] or 'flight'}: {said.headline}",
-        f"{summary['estimator']}: {summary['rows']} rows, t = {solution.t[0]:.2f} to {solution.t[-1]:.2f} s, aligned at t = {summary['aligned_at']:.2f} s",
+        f"{summary['estimator']}: {summary['rows']} rows, t = {solution.t[0]:.2f} to {solution.t[-1]:.2f} s, "
+        f"aligned at t = {summary['aligned_at']:.2f} s",
     ]
     for name, rows in summary["errors"].items():
         shown = [

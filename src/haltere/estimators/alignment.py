@@ -22,6 +22,7 @@ from haltere.aids.record import (
     GNSS_VELOCITY,
     MAGNETOMETER,
     N_QUEUED,
+    NO_SENSOR,
     event,
 )
 from haltere.core.rotation import (
@@ -219,7 +220,7 @@ def start(s: Any, prm: Any, kind: int, f_b: Vec, a_n: Vec) -> None:
     s.phase = 2
     s.t_aligned = s.t
     s.t_wake = s.t
-    event(s, s.t, E_ALIGNED if s.n_aligned == 0 else E_REALIGNED, 0, float(kind))
+    event(s, s.t, E_ALIGNED if s.n_aligned == 0 else E_REALIGNED, NO_SENSOR, float(kind))
     s.n_aligned += 1
 
 

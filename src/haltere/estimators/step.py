@@ -15,6 +15,7 @@ from haltere.aids.record import (
     GNSS_POSITION,
     GNSS_VELOCITY,
     MAGNETOMETER,
+    NO_SENSOR,
     event,
 )
 from haltere.core.rotation import Vec, cross, dcm, mat_vec, quat_from_rotvec, quat_mul
@@ -152,7 +153,7 @@ def bridge_gap(s: Any, prm: Any, w0: Vec, f0: Vec, w1: Vec, f1: Vec, dt: float) 
         s.P[i, i] += turn * turn
         s.P[3 + i, 3 + i] += push_v * push_v
         s.P[6 + i, 6 + i] += push_p * push_p
-    event(s, s.t, E_GAP, 0, dt)
+    event(s, s.t, E_GAP, NO_SENSOR, dt)
     s.n_gaps += 1
 
 
@@ -178,7 +179,7 @@ def advance(s: Any, prm: Any, rows: Any, cov: Any, aids: Any) -> None:
         write_covariance(s, prm, cov)
         return
     if dt > prm.timeout_imu:  # too long to bridge: align anew
-        event(s, t, E_GAP, 0, dt)
+        event(s, t, E_GAP, NO_SENSOR, dt)
         s.n_gaps += 1
         alignment.begin(s, t)
         s.n_unaligned += 1
@@ -216,7 +217,7 @@ def advance(s: Any, prm: Any, rows: Any, cov: Any, aids: Any) -> None:
             if prm.aid_yaw_bank > 0.0:
                 yaw_bank.update(s, s.yaw.z[0], s.yaw.z[1], s.yaw.r)
     if t >= s.t_covariance and not sound(s):
-        event(s, t, E_DIVERGED, 0, 0.0)
+        event(s, t, E_DIVERGED, NO_SENSOR, 0.0)
         alignment.begin(s, t)
         s.n_unaligned += 1
         return
@@ -307,8 +308,8 @@ def run_chunk(
 ) -> tuple[int, int]:
     """Drive `offer` and `step` over IMU samples i ... i_end - 1 and the measurements stamped at or before them.
 
-    Stops early when the record arrays are nearly full, so that nothing is lost. The same calls in the same order online give
-    the same numbers.
+    After the last sample of all, the horizon moves up to it, as `flush` does. Stops early when the output arrays are nearly
+    full, so that nothing is lost. The same calls in the same order online give the same numbers.
 
     Parameters
     ----------
@@ -324,10 +325,13 @@ def run_chunk(
     tuple of int
         Next IMU sample and next measurement.
     """
-    s = S[0]
-    while i < i_end:
+    s, prm = S[0], PRM[0]
+    while i < i_end or (i == len(t) and s.imu_n > 0):
         if s.n_aids > len(aids) - 2048 or s.n_events > len(s.event) - 8 or s.n_rows > rows.shape[0] - 2 * len(s.imu):
             break
+        if i == len(t):
+            advance(s, prm, rows, cov, aids)
+            continue
         while j < len(stamps) and stamps[j] <= t[i]:
             offer(S, PRM, kinds[j], stamps[j], (z[j, 0], z[j, 1], z[j, 2]), (r[j, 0], r[j, 1], r[j, 2]))
             j += 1

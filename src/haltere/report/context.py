@@ -124,7 +124,7 @@ class Context:
 
     @cached_property
     def held_by_measurement(self) -> bool:
-        """Was a position from GNSS ever let in?"""
+        """Whether a position from GNSS was ever let in."""
         a = self.solution.aids
         return bool(np.any((a["sensor"] == "gnss") & (a["status"] != "rejected") & np.char.startswith(a["component"].astype(str), "pos")))
 

@@ -61,7 +61,8 @@ def track(c: Context) -> Section:
             add(name, name, t, p, False)
     ends = c.solution.vector("pos", "ned")[[0, -1]]
     traces.append({
-        "type": "scatter", "name": "start and end", "x": ends[:, 1].tolist(), "y": ends[:, 0].tolist(), "mode": "markers+text", "text": ["start", "end"],
+        "type": "scatter", "name": "start and end", "x": ends[:, 1].tolist(), "y": ends[:, 0].tolist(), "mode": "markers+text",
+        "text": ["start", "end"],
         "textposition": ["top right", "bottom right"], "textfont": {"color": "@text"}, "hoverinfo": "skip",
         "marker": {"size": 10, "symbol": ["circle-open", "square-open"], "color": "@text", "line": {"width": 2}},
     })  # fmt: skip
@@ -70,7 +71,8 @@ def track(c: Context) -> Section:
     axis = {**AXES, "zeroline": True, "nticks": 8}
     layout = {
         "margin": {"l": LEFT, "r": 12, "t": TOP, "b": FOOT}, "hovermode": "closest",
-        "xaxis": {**axis, "title": {"text": "east [m]", "standoff": 4}, "range": [middle[1] - half, middle[1] + half], "constrain": "domain"},
+        "xaxis": {**axis, "title": {"text": "east [m]", "standoff": 4}, "range": [middle[1] - half, middle[1] + half],
+                  "constrain": "domain"},
         "yaxis": {**axis, "title": {"text": "north [m]", "standoff": 6}, "range": [middle[0] - half, middle[0] + half], "scaleanchor": "x",
                   "constrain": "domain"},
     }  # fmt: skip
@@ -132,7 +134,8 @@ def timeline(c: Context) -> Section:
     if happened:
         labels.append("events")
         traces.append({
-            "type": "scatter", "name": "event", "mode": "markers", "x": [float(e["t_onset"]) for e in happened], "y": [len(labels) - 1] * len(happened),
+            "type": "scatter", "name": "event", "mode": "markers", "x": [float(e["t_onset"]) for e in happened],
+            "y": [len(labels) - 1] * len(happened),
             "marker": {"symbol": "star", "size": 11, "color": "@event"}, "hovertemplate": "t = %{x:.2f} s: %{text}", "showlegend": False,
             "text": [plain(f"{sensor_label(e['sensor'])}: {e['kind']}. {e.get('evidence') or ''}") for e in happened],
         })  # fmt: skip
@@ -163,6 +166,6 @@ def _bars(
         x += [round(a, 4), round(max(b, a + least), 4), None]
         texts += [words, words, None]
     return {
-        "type": "scatter", "name": label, "legendgroup": label, "showlegend": legend, "mode": "lines", "x": x, "y": [row] * len(x), "text": texts,
-        "line": {"color": colour, "width": width}, "hovertemplate": "%{text}<extra></extra>",
+        "type": "scatter", "name": label, "legendgroup": label, "showlegend": legend, "mode": "lines", "x": x, "y": [row] * len(x),
+        "text": texts, "line": {"color": colour, "width": width}, "hovertemplate": "%{text}<extra></extra>",
     }  # fmt: skip

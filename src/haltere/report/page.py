@@ -21,6 +21,13 @@ __all__ = ["LIMIT", "page"]
 #: Largest file [bytes], and about how many points a series shows: fewer only where the file would be larger.
 LIMIT, POINTS = 4_800_000, (4000, 2500, 1500, 800, 400)
 
+#: The page runs its own scripts and styles, and even a fault in it cannot reach the network.
+POLICY = "default-src 'none'; script-src 'unsafe-inline'; style-src 'unsafe-inline'; img-src data: blob:; font-src data:"
+FOOTER = (
+    "Units are SI, angles in degrees for reading. Drag to zoom, all time axes follow; double-click to see all again; click a name above "
+    "a plot to hide it. Long series are thinned for display, with their extremes kept; solution.parquet and aids.parquet have every row."
+)
+
 
 @lru_cache(maxsize=1)
 def _plotly() -> str:
@@ -63,8 +70,8 @@ def _assemble(c: Context, command: str | None) -> str:
     timeline = overview.timeline(c)
     timeline.after = tables.events(c)
     parts = [
-        timeline, sections.attitude(c), sections.velocity(c), sections.position(c), sections.biases(c), sections.wind(c), sections.errors(c),
-        sections.innovations(c), tables.consistency(c), tables.data(c), tables.configuration(c, command),
+        timeline, sections.attitude(c), sections.velocity(c), sections.position(c), sections.biases(c), sections.wind(c),
+        sections.errors(c), sections.innovations(c), tables.consistency(c), tables.data(c), tables.configuration(c, command),
     ]  # fmt: skip
     shown = [s for s in parts if s is not None and (s.figures or s.note or s.after)]
     track = overview.track(c)
@@ -76,9 +83,7 @@ def _assemble(c: Context, command: str | None) -> str:
     return "\n".join(
         [
             '<!DOCTYPE html>\n<html lang="en">\n<head>\n<meta charset="utf-8">',
-            # The page may run its own scripts and nothing else; even a fault in it cannot reach the network.
-            "<meta http-equiv=\"Content-Security-Policy\" content=\"default-src 'none'; script-src 'unsafe-inline'; style-src 'unsafe-inline'; "
-            'img-src data: blob:; font-src data:">',
+            f'<meta http-equiv="Content-Security-Policy" content="{POLICY}">',
             '<meta name="viewport" content="width=device-width, initial-scale=1">',
             f'<meta name="generator" content="haltere {escape(__version__)}">',
             f"<title>{escape(name)} – haltere</title>",
@@ -88,8 +93,7 @@ def _assemble(c: Context, command: str | None) -> str:
             f'<nav>{links}</nav>\n<main>\n<noscript><p class="trouble">The plots need JavaScript; the tables below do not.</p></noscript>',
             '<p class="trouble" id="trouble" hidden></p>',
             *body,
-            f"</main>\n<footer>haltere {escape(__version__)}. Units are SI, angles in degrees for reading. Drag to zoom, all time axes follow; "
-            "double-click to see all again; click a name above a plot to hide it.</footer>",
+            f"</main>\n<footer>haltere {escape(__version__)}. {FOOTER}</footer>",
             f'<script type="application/octet-stream" id="library">{_plotly()}</script>',
             f'<script type="application/octet-stream" id="numbers">{pack(numbers)}</script>',
             f"<script>{_resource('page.js')}</script>",
@@ -111,7 +115,8 @@ def _header(c: Context) -> str:
 def _first(c: Context, track: Section, figures: list[Figure]) -> str:
     """Map and facts, side by side where there is room."""
     rows = "".join(f"<tr><th>{escape(name)}</th><td>{escape(value)}</td></tr>" for name, value in facts(c))
-    return f'<div class="first">\n<section id="facts"><h2>Flight</h2><table class="facts">{rows}</table></section>\n{_section(track, figures)}\n</div>'
+    flown = f'<section id="facts"><h2>Flight</h2><table class="facts">{rows}</table></section>'
+    return f'<div class="first">\n{flown}\n{_section(track, figures)}\n</div>'
 
 
 def _section(section: Section, figures: list[Figure]) -> str:
@@ -122,9 +127,8 @@ def _section(section: Section, figures: list[Figure]) -> str:
     for figure in section.figures:
         if "title" in figure:
             out.append(f"<h3>{escape(figure['title'])}</h3>")
-        out.append(
-            f'<div class="figure" id="figure-{escape(figure["name"])}" data-figure="{len(figures)}" style="height:{figure["height"]}px"></div>'
-        )
+        name, height = f"figure-{escape(figure['name'])}", figure["height"]
+        out.append(f'<div class="figure" id="{name}" data-figure="{len(figures)}" style="height:{height}px"></div>')
         figures.append(figure)
     out.append(f"{section.after}</section>")
     return "\n".join(out)

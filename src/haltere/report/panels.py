@@ -101,9 +101,11 @@ class Panels:
             ids.append(self.pool.add(shown[2], resolution))
             known = shown[2][np.isfinite(shown[2])]
             reach = 1.5 * float(np.median(known)) if len(known) else 0.0
-            band = {"t": ids[0], "y": None if centred else ids[1], "sd": ids[2]}
-            self._trace(row, "±1σ" if centred else f"{label} ±1σ", **{"$band": band}, mode="lines", fill="toself", hoverinfo="skip",
-                        fillcolor=f"@{'limit' if centred else colour}/{0.3 if centred else 0.22}", line={"width": 0})  # fmt: skip
+            band: dict[str, Any] = {
+                "$band": {"t": ids[0], "y": None if centred else ids[1], "sd": ids[2]}, "mode": "lines", "fill": "toself",
+                "hoverinfo": "skip", "fillcolor": "@limit/0.3" if centred else f"@{colour}/0.22", "line": {"width": 0},
+            }  # fmt: skip
+            self._trace(row, "±1σ" if centred else f"{label} ±1σ", **band)
         low, high = float(finite.min()), float(finite.max())
         self._widen(row, *((min(low, -reach), max(high, reach)) if centred else (low - reach, high + reach)))
         few = len(finite) <= 60

@@ -70,7 +70,7 @@ def position(c: Context) -> Section | None:
         return None
     note = "From the origin, north, east and down; the axis of down points down."
     if not c.held_by_measurement:
-        note += " <strong>No GNSS position was let in: the position is dead reckoning held near the start by an assumption, not measured.</strong>"
+        note += " <strong>No GNSS position was let in: this is dead reckoning, held near the start by an assumption.</strong>"
     panels = _panels(c, "position", [f"{WORDS[a]} [m]" for a in "ned"])
     panels.reversed = {2}
     for k, a in enumerate("ned"):
@@ -148,7 +148,7 @@ def errors(c: Context) -> Section | None:
             if at is not None:
                 panels.limits(k, "±3σ", t, 3.0 * at)
         figures.append({**panels.figure(), "title": title})
-    note = "The band is what the filter states: two thirds of the time the error should lie inside, and almost always between the dotted lines."
+    note = "The band is what the filter states: the error should lie inside for two thirds of the time, and nearly always between the dots."
     return Section("errors", "Errors against truth", note, figures)
 
 
@@ -206,6 +206,6 @@ def _innovation(c: Context, panels: Panels, row: int, sensor: str, component: st
     ):
         mine = status == word
         if mine.any():
-            panels.markers(row, name, colour, t[mine], e[mine], symbol=symbol, texts=[f"{name}: {r}" if r else name for r in reason[mine].tolist()],
-                           unit=unit, resolution=resolution, widen=False)  # fmt: skip
+            texts = [f"{name}: {why}" if why else name for why in reason[mine].tolist()]
+            panels.markers(row, name, colour, t[mine], e[mine], symbol=symbol, texts=texts, unit=unit, resolution=resolution, widen=False)
     return int(np.count_nonzero(refused > 1.06 * reach))

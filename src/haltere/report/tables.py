@@ -10,7 +10,7 @@ from typing import Any
 from haltere.flight.config import KEYS, Value, defaults
 from haltere.flight.schema import base_name
 from haltere.report.context import Context, Section, sensor_label
-from haltere.report.words import discarded, episode_in_words, nis_in_words, number
+from haltere.report.words import count, discarded, episode_in_words, nis_in_words, number
 
 __all__ = ["configuration", "consistency", "data", "errors_table", "escape", "events", "table"]
 
@@ -63,10 +63,10 @@ def consistency(c: Context) -> Section:
     summary = c.solution.summary
     section = Section("consistency", "Is the stated uncertainty true?")
     nis = summary.get("nis", {})
-    rows = [
+    rows: list[tuple[str, ...]] = [
         (
-            escape(sensor_label(sensor)), f"{v['n']:,}", number(v["mean"]), f"{number(v['band'][0])} … {number(v['band'][1])}", f"{v['rejected']:,}",
-            f"{v['deweighted']:,}", escape(nis_in_words(v["mean"], v["band"])),
+            escape(sensor_label(sensor)), f"{v['n']:,}", number(v["mean"]), f"{number(v['band'][0])} … {number(v['band'][1])}",
+            f"{v['rejected']:,}", f"{v['deweighted']:,}", escape(nis_in_words(v["mean"], v["band"])),
         )
         for sensor, v in ((s, nis[s]) for s in c.sensors if s in nis)
     ]  # fmt: skip
@@ -78,8 +78,8 @@ def consistency(c: Context) -> Section:
         for block, v in summary.get("nees", {}).items()
     ]
     if rows:
-        section.after += table(("block", "mean NEES", "95 % band", "degrees of freedom"), rows,
-                               caption="squared errors over their stated variance a degree of freedom (NEES), against truth; 1 is ideal")  # fmt: skip
+        caption = "squared errors over their stated variance a degree of freedom (NEES), against truth; 1 is ideal"
+        section.after += table(("block", "mean NEES", "95 % band", "degrees of freedom"), rows, caption=caption)
     elif nis:
         section.after += "<p>No NEES: it needs a truth, and this flight has none.</p>"
     section.after += errors_table(c)
@@ -94,8 +94,8 @@ def data(c: Context) -> Section:
     section = Section("data", "Data, and what was discarded")
     lost = discarded(summary)
     if lost:
-        rows = [(escape(s), escape(why), f"{n:,}", f"{100.0 * n / max(size, 1):.2g} %") for s, why, n, size in lost]
-        section.after += table(("stream", "reason ", "samples", "of the stream"), rows, caption="discarded")
+        left = [(escape(s), escape(why), f"{n:,}", f"{100.0 * n / max(size, 1):.2g} %") for s, why, n, size in lost]
+        section.after += table(("stream", "reason ", "samples", "of the stream"), left, caption="discarded")
     else:
         section.after += "<p>No sample was discarded.</p>"
     warnings = summary.get("warnings", [])
@@ -143,7 +143,8 @@ def events(c: Context) -> str:
     if largest:
         items = "".join(f"<li>{escape(episode_in_words(e))}</li>" for e in largest)
         more = f"<p>{len(c.episodes) - len(largest)} smaller stretches in aids.parquet.</p>" if len(c.episodes) > len(largest) else ""
-        out += f"<details><summary>{len(c.episodes)} stretches of refused or de-weighted measurements</summary><ul>{items}</ul>{more}</details>"
+        title = f"{count(len(c.episodes), 'stretch', 'stretches')} of refused or de-weighted measurements"
+        out += f"<details><summary>{title}</summary><ul>{items}</ul>{more}</details>"
     return out
 
 
@@ -164,8 +165,8 @@ def configuration(c: Context, command: str | None) -> Section:
         before = usual[key]
         same = value == before or (isinstance(value, float) and isinstance(before, float) and math.isnan(value) and math.isnan(before))
         found = not same and isinstance(before, float) and math.isnan(before)
-        row = (f"<code>{escape(key)}</code>", f"<b>{escape(_shown(value))}</b>" if not same else escape(_shown(value)), escape(KEYS[key].unit),
-               escape(_shown(before)), escape(KEYS[key].doc))  # fmt: skip
+        shown = escape(_shown(value)) if same else f"<b>{escape(_shown(value))}</b>"
+        row = (f"<code>{escape(key)}</code>", shown, escape(KEYS[key].unit), escape(_shown(before)), escape(KEYS[key].doc))
         rows.append(row)
         marks.append("" if same else "found" if found else "changed")
         if not same:

@@ -43,9 +43,9 @@ def fixed(value: float) -> str:
     return f"{value:#.2g}" if 1e-3 <= abs(value) < 0.995 else f"{value:.1f}" if abs(value) < 1e4 else f"{value:.1e}"
 
 
-def count(n: int, thing: str) -> str:
+def count(n: int, thing: str, things: str | None = None) -> str:
     """``1 sample``, ``28 samples``, ``12,345 samples``."""
-    return f"{n:,} {thing}{'' if n == 1 else 's'}"
+    return f"{n:,} {thing if n == 1 else things or thing + 's'}"
 
 
 def discarded(summary: dict[str, Any]) -> list[tuple[str, str, int, int]]:
@@ -128,10 +128,10 @@ def episode_in_words(e: Episode) -> str:
 def _what_happened(c: Context) -> list[str]:
     out = []
     noted = [e for e in c.solution.events if e["kind"] != "aligned" and not str(e.get("evidence")).startswith("first measurement")]
-    for e in noted[:4]:
-        when = e.get("t_onset") if e.get("t_onset") is not None else e.get("t_detected")
+    for event in noted[:4]:
+        when = event.get("t_onset") if event.get("t_onset") is not None else event.get("t_detected")
         at = f"At t = {when:.1f} s" if when is not None else "At some time"
-        out.append(f"{at}: {sensor_label(e['sensor'])} {e['kind']}{', ' + e['evidence'] if e.get('evidence') else ''}.")
+        out.append(f"{at}: {sensor_label(event['sensor'])} {event['kind']}{', ' + event['evidence'] if event.get('evidence') else ''}.")
     if len(noted) > 4:
         out.append(f"{count(len(noted) - 4, 'further event')} in the table below.")
     sensors = [e for e in c.episodes if not e.sensor.startswith(("zero", "fake"))]
