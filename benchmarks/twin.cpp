@@ -10,7 +10,7 @@
 
 namespace {
 
-constexpr int N = 16;
+constexpr int N = 16, WIDTH = 37;
 constexpr int THETA = 0, VEL = 3, POS = 6, BG = 9, BA = 12, BARO = 15;
 constexpr double DEG = M_PI / 180.0;
 constexpr double ABSENT = 1e18;
@@ -412,10 +412,10 @@ struct Filter {
         fuse(3, stamp, 1, &H, &z, &h, &r, prm.gate_magnetometer, prm.timeout_magnetometer, refused, true);
     }
 
-    // Rows of the output, one array of n each: t, q, v, p, biases, attitude covariance, other variances, barometer.
-    void write(double* rows, int64_t n, int64_t i) const {
-        double* o = rows + i;
-        auto put = [&o, n](double x) { *o = x, o += n; };
+    // One row of the output: t, q, v, p, biases, attitude covariance, other variances, barometer.
+    void write(double* rows, int64_t i) const {
+        double* o = rows + WIDTH * i;
+        auto put = [&o](double x) { *o++ = x; };
         put(t);
         put(q.w), put(q.x), put(q.y), put(q.z);
         for (const Vec& x : {v, p, bg, ba}) put(x.x), put(x.y), put(x.z);
@@ -437,7 +437,7 @@ void run(State* state, const Parameters* parameters, const double* t, const doub
     Filter filter;
     filter.begin(*state, *parameters);
     filter.t = t[0];
-    filter.write(rows, n, 0);
+    filter.write(rows, 0);
     int64_t j = 0;
     for (int64_t i = 1; i < n; ++i) {
         const double dt = t[i] - t[i - 1];
@@ -452,7 +452,7 @@ void run(State* state, const Parameters* parameters, const double* t, const doub
                 case 3: filter.magnetometer(stamp[j], zj); break;
             }
         }
-        filter.write(rows, n, i);
+        filter.write(rows, i);
     }
     filter.end(*state);
 }

@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 
 from haltere.aids.record import BAROMETER, GNSS_POSITION, GNSS_VELOCITY, MAGNETOMETER
 from haltere.core.earth import geodetic_from_local, gravity
-from haltere.core.rotation import dcm, quat_from_euler
+from haltere.core.rotation import quat_from_euler
 from haltere.estimators.base import InitialState
 from haltere.flight import config as configuration
 from haltere.flight.config import Config
@@ -72,6 +72,16 @@ def _sum_of_sines(t: FloatArray, terms: tuple[tuple[float, float, float], ...]) 
     return x, v, a
 
 
+def _fixes(pos: FloatArray) -> FloatArray:
+    """Latitude, longitude [deg], altitude [m] of positions NED from `HOME`, on the ellipsoid."""
+    lat0, lon0, alt0 = math.radians(HOME[0]), math.radians(HOME[1]), HOME[2]
+    a, e2 = 6378137.0, 6.69437999014e-3
+    w2 = 1.0 - e2 * math.sin(lat0) ** 2
+    lat = lat0 + pos[:, 0] / (a * (1.0 - e2) / w2**1.5 + alt0)
+    lon = lon0 + pos[:, 1] / ((a / math.sqrt(w2) + alt0) * np.cos(0.5 * (lat + lat0)))
+    return np.stack([np.degrees(lat), np.degrees(lon), alt0 - pos[:, 2]], 1)
+
+
 def fly(n: int = 100_000, rate: float = 1000.0, magnetometer: int = 10, barometer: int = 20, gnss: int = 100, seed: int = 1) -> Flight:
     """A flight on sines with exact derivatives and matched noise; an interval of 0 leaves a sensor out.
 
@@ -104,7 +114,16 @@ def fly(n: int = 100_000, rate: float = 1000.0, magnetometer: int = 10, baromete
     accel += 0.035 * math.sqrt(rate) * 0.5 * rng.standard_normal((n, 3)) + np.array([0.03, -0.02, 0.04])
     field = FIELD[2] * np.array([math.cos(FIELD[1]) * math.cos(FIELD[0]), math.cos(FIELD[1]) * math.sin(FIELD[0]), math.sin(FIELD[1])])
     mag = np.einsum("nji,j->ni", C, field) + 1.0 * rng.standard_normal((n, 3))
-    q = np.array([quat_from_euler(roll[0], pitch[0], yaw[0])])
+    c, s = np.cos(0.5 * np.array([roll, pitch, yaw])), np.sin(0.5 * np.array([roll, pitch, yaw]))
+    q = np.stack(
+        [
+            c[0] * c[1] * c[2] + s[0] * s[1] * s[2],
+            s[0] * c[1] * c[2] - c[0] * s[1] * s[2],
+            c[0] * s[1] * c[2] + s[0] * c[1] * s[2],
+            c[0] * c[1] * s[2] - s[0] * s[1] * c[2],
+        ],
+        1,
+    )
     vel, pos = np.stack([v_n, v_e, v_d], 1), np.stack([north, east, down], 1)
 
     parts: list[tuple[int, NDArray[np.intp], FloatArray]] = []
@@ -113,7 +132,7 @@ def fly(n: int = 100_000, rate: float = 1000.0, magnetometer: int = 10, baromete
         k = every[every % gnss == 0]
         parts.append((int(GNSS_VELOCITY), k, vel[k] + 0.15 * rng.standard_normal((len(k), 3))))
         where = pos[k] + np.array([0.5, 0.5, 1.0]) * rng.standard_normal((len(k), 3))
-        parts.append((int(GNSS_POSITION), k, np.array([geodetic_from_local(*p, *HOME) for p in where]).reshape(-1, 3)))
+        parts.append((int(GNSS_POSITION), k, _fixes(where)))
     if barometer:
         k = every[every % barometer == 0]
         h = HOME[2] - down[k] + 0.5 + 0.3 * rng.standard_normal(len(k))
@@ -185,13 +204,19 @@ class Twin:
         """State to run from."""
         state = np.zeros(1, STATE)
         state["t"], state["baro"], state["P"][0] = initial.t, initial.baro_bias, initial.P
-        for name, value in (("q", initial.q_nb), ("v", initial.vel_n), ("p", initial.pos_n), ("bg", initial.gyro_bias_b), ("ba", initial.accel_bias_b)):
+        for name, value in (
+            ("q", initial.q_nb),
+            ("v", initial.vel_n),
+            ("p", initial.pos_n),
+            ("bg", initial.gyro_bias_b),
+            ("ba", initial.accel_bias_b),
+        ):
             state[name][0] = value
         state["t_passed"] = initial.t
         return state
 
     def run(self, state: NDArray[np.void], f: Flight, rows: FloatArray) -> None:
-        """Run over a whole flight: the state is brought to its end, ``rows`` (37, n) is filled."""
+        """Run over a whole flight: the state is brought to its end, ``rows`` (n, 37) is filled."""
 
         def at(a: NDArray[Any]) -> ctypes.c_void_p:
             return ctypes.c_void_p(a.ctypes.data)

@@ -11,6 +11,10 @@ from haltere.flight.log import FlightLog, FlightMeta
 DEG = np.pi / 180.0
 
 
+def _columns(stem: str, vectors: np.ndarray, axes: str = "xyz") -> dict[str, np.ndarray]:
+    return {f"{stem}_{a}": vectors[:, k] for k, a in enumerate(axes)}
+
+
 def ecl_replay(path: Path) -> FlightLog:
     """PX4-ECL replay: lines ``time_us,sensor,values``; imu is accel then gyro, mag in gauss, gps alt [mm], lon, lat [1e-7 deg]."""
     rows: dict[str, list[list[float]]] = {}
@@ -20,7 +24,7 @@ def ecl_replay(path: Path) -> FlightLog:
     a = {k: np.array(v) for k, v in rows.items()}
     imu, mag, baro, gps = a["imu"], a["mag"], a["baro"], a["gps"]
     streams = {
-        "imu": {"t": imu[:, 0]} | {f"accel_{x}": imu[:, 1 + k] for k, x in enumerate("xyz")} | {f"gyro_{x}": imu[:, 4 + k] for k, x in enumerate("xyz")},
+        "imu": {"t": imu[:, 0], **_columns("accel", imu[:, 1:]), **_columns("gyro", imu[:, 4:])},
         "magnetometer": {"t": mag[:, 0]} | {f"mag_{x}": 100.0 * mag[:, 1 + k] for k, x in enumerate("xyz")},
         "barometer": {"t": baro[:, 0], "altitude": baro[:, 1]},
         "gnss": {
@@ -59,7 +63,7 @@ def inertialnav(folder: Path, *, gauss: float) -> FlightLog:
         q = _quaternions(att[:, 2:5] * DEG)
         onboard = {"onboard": {"t": att[:, 1] * 1e-3} | {f"q_{x}": q[:, k] for k, x in enumerate("wxyz")}}
     streams = {
-        "imu": {"t": imu[:, 1] * 1e-3} | {f"gyro_{x}": imu[:, 2 + k] for k, x in enumerate("xyz")} | {f"accel_{x}": imu[:, 5 + k] for k, x in enumerate("xyz")},
+        "imu": {"t": imu[:, 1] * 1e-3, **_columns("gyro", imu[:, 2:]), **_columns("accel", imu[:, 5:])},
         "magnetometer": {"t": mag[:, 1] * 1e-3} | {f"mag_{x}": gauss * field[:, k] for k, x in enumerate("xyz")},
         "gnss": {"t": gps[:, 2] * 1e-3, "lat": gps[:, 6], "lon": gps[:, 7], "alt": gps[:, 9], "fix_type": gps[:, 1]}
         | {f"vel_{x}": velocity[:, k] for k, x in enumerate("ned")},

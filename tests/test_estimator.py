@@ -198,9 +198,9 @@ def test_one_bad_sample_is_left_out(flight: FlightLog, t: float, gyro: tuple[flo
 
 def test_offer_says_what_is_wrong() -> None:
     est = Estimator("navigator")
-    with pytest.raises(UsageError, match="gnss, barometer or magnetometer"):
+    with pytest.raises(UsageError, match="a sensor: gnss"):
         est.offer("lidar", 0.0, (1.0,))
-    with pytest.raises(UsageError, match="3 values|3 to"):
+    with pytest.raises(UsageError, match="3 to 3 values"):
         est.offer("magnetometer", 0.0, (1.0,))
     assert not est.offer("magnetometer", 0.0, (float("nan"), 1.0, 1.0))
     assert not est.offer("magnetometer", 0.0, (0.0, 0.0, 0.0))
@@ -228,7 +228,7 @@ def test_what_is_not_there_is_said(flight: FlightLog) -> None:
     for option in ({"smooth": True}, {"vehicle": "x.toml"}, {"preset": "as-printed"}):
         with pytest.raises(UsageError):
             run(flight, **option)  # type: ignore[arg-type]
-    with pytest.raises(UsageError, match="did you mean 'gate.gnss'"):
+    with pytest.raises(UsageError, match=r"did you mean 'gate\.gnss'"):
         run(flight, set={"gate.gns": 4})
 
 

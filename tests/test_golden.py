@@ -10,9 +10,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from converters import ecl_replay
 
 import haltere
+from converters import ecl_replay
 from haltere.drive import run
 from haltere.metrics.attitude import euler
 from haltere.simulate import demo_flight

@@ -56,7 +56,8 @@ if COMPILED:
         before = numba.config.CACHE_DIR  # type: ignore[attr-defined]
         numba.config.CACHE_DIR = _FOLDER  # type: ignore[attr-defined]
         try:
-            return cast(F, numba.njit(cache=True, error_model="numpy", **options)(function))
+            compiled: object = numba.njit(cache=True, error_model="numpy", **options)(function)  # type: ignore[call-overload]
+            return cast(F, compiled)
         finally:
             numba.config.CACHE_DIR = before  # type: ignore[attr-defined]
 

@@ -17,17 +17,16 @@ __all__ = ["offer"]
 def offer(s: Any, prm: Any, m: Any, aids: Any) -> Offer:
     """Barometer: z = h - h_origin = -p_D + b_baro (theory-amendments.md §8). The first sample sets the offset (start).
 
-    ``m.z[0]`` is the pressure altitude [m]. Only for a layout with the offset.
+    ``m.z[0]`` is the pressure altitude [m]. In a layout without the offset it stays at its start value.
     """
-    if len(s.baro) == 0:
-        return NOTHING
     z = m.z[0] - s.origin[2]
     a = s.aid[BAROMETER]
     if a.started == 0:
         a.started = RUNNING
         a.t_passed = m.t
+        s.baro_start = z + s.p[2]
         for i in range(len(s.baro)):
-            s.baro[i] = z + s.p[2]
+            s.baro[i] = s.baro_start
             for j in range(s.P.shape[0]):
                 s.P[15 + i, j] = 0.0
                 s.P[j, 15 + i] = 0.0
@@ -35,10 +34,11 @@ def offer(s: Any, prm: Any, m: Any, aids: Any) -> Offer:
         record(s, aids, m.t, BAROMETER, C_ALTITUDE, z, 0.0, prm.init_baro_bias, 0.0, 1.0, FUSED, R_START)
         return NOTHING
     r = m.r[0] if m.r[0] >= 0.0 else prm.noise_barometer * prm.noise_barometer
-    h = -s.p[2]
+    h = s.baro_start - s.p[2]
+    row = ((POS, (0.0, 0.0, -1.0)), NONE, NONE)
     for i in range(len(s.baro)):
-        h += s.baro[i]
-    row = ((POS, (0.0, 0.0, -1.0)), (LAST, (0.0, 0.0, 1.0)), NONE)
+        h = s.baro[i] - s.p[2]
+        row = ((POS, (0.0, 0.0, -1.0)), (LAST, (0.0, 0.0, 1.0)), NONE)
     return (
         ONE, C_ALTITUDE, (z, 0.0, 0.0), (h, 0.0, 0.0), (r, r, r), (row, row, row), prm.gate_barometer, prm.timeout_barometer, R_NONE, False,
     )  # fmt: skip

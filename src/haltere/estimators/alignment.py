@@ -206,8 +206,9 @@ def start(s: Any, prm: Any, kind: int, f_b: Vec, a_n: Vec) -> None:
         P[9 + i, 9 + i] = sd_bg * sd_bg
         s.ba[i] = 0.0
         P[12 + i, 12 + i] = prm.init_accel_bias * prm.init_accel_bias
+    s.baro_start = a.baro - s.origin[2] + s.p[2]
     for i in range(len(s.baro)):
-        s.baro[i] = a.baro - s.origin[2] + s.p[2]
+        s.baro[i] = s.baro_start
         P[15 + i, 15 + i] = prm.init_baro_bias * prm.init_baro_bias
     for k2 in range(len(s.aid)):
         s.aid[k2].t_passed = s.t

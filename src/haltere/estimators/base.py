@@ -139,6 +139,7 @@ def _begin_from(record: NDArray[np.void], initial: InitialState) -> None:
         ("ba", initial.accel_bias_b),
     ):
         record[name][0] = values
+    record["baro_start"] = initial.baro_bias
     if n > CORE:
         record["baro"][0, 0] = initial.baro_bias
     record["q"][0] /= np.linalg.norm(record["q"][0])
@@ -254,7 +255,7 @@ class Estimator:
                 h = float(values.get("altitude", math.nan))
             else:
                 h = float(altitude_of(np.array(_in_order(sensor, values, ("pressure",), 1)), self.config)[0])
-            if self.config["baro.offset"] == "off" or not math.isfinite(h):
+            if not math.isfinite(h):
                 return False
             return bool(kernels.offer(self._S, self._prm, BAROMETER, t, (h, math.nan, math.nan), _NAN) in (1, -1))
         if sensor == "magnetometer":

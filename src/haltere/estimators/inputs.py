@@ -122,7 +122,7 @@ def _mounted(flight: FlightLog, stream: str, vectors: FloatArray) -> FloatArray:
     if not math.isfinite(sum(q)) or abs(math.sqrt(sum(x * x for x in q)) - 1.0) > 1e-2:
         raise HaltereError("a unit quaternion q_b_sensor", f"{q}", f"flight.toml [mounting] {stream}")
     out = np.empty_like(vectors)
-    _turn(np.ascontiguousarray(vectors), tuple(float(x) for x in q), out)
+    _turn(np.ascontiguousarray(vectors), (float(q[0]), float(q[1]), float(q[2]), float(q[3])), out)
     return out
 
 
@@ -170,7 +170,7 @@ def measurements(flight: FlightLog, checked: Checked, config: Config) -> Measure
             there = np.isfinite(values[:, :2]).all(axis=1)
             parts.append((code, gnss.t[there], values[there], variances[there]))
     baro = checked.streams.get("barometer")
-    if baro is not None and config["aid.barometer"] == "on" and config["baro.offset"] == "on":
+    if baro is not None and config["aid.barometer"] == "on":
         pressure = baro.get("pressure")
         h = altitude_of(pressure, config) if np.isfinite(pressure).any() else baro.get("altitude").copy()
         there = np.isfinite(h)

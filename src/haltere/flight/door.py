@@ -133,8 +133,10 @@ def _check_magnetometer(out: Checked, stream: Stream) -> Stream:
         return stream
     middle = float(np.median(np.linalg.norm(stream.vector("mag"), axis=1)))
     if not 5.0 < middle < 200.0:
-        looks = next((f"it looks like {unit}" for unit, low, high in (("gauss", 0.1, 1.5), ("milligauss", 200.0, 1500.0), ("tesla", 1e-5, 1.5e-4))
-                      if low < middle < high), "calibrate it")  # fmt: skip
+        looks = "calibrate it"
+        for unit, low, high in (("gauss", 0.1, 1.5), ("milligauss", 200.0, 1500.0), ("tesla", 1e-5, 1.5e-4)):
+            if low < middle < high:
+                looks = f"it looks like {unit}"
         out.warnings.append(f"magnetometer: expected a field of 20 to 70 uT, found a median of {middle:.3g}; not used; {looks}")
         return out.drop("magnetometer", stream, np.zeros(len(stream), bool), "strength impossible in uT")
     return stream

@@ -28,7 +28,8 @@ def multiply(a: FloatArray, b: FloatArray) -> FloatArray:
 
 def conjugate(q: FloatArray) -> FloatArray:
     """Inverse of unit quaternions."""
-    return np.asarray(q) * np.array([1.0, -1.0, -1.0, -1.0])
+    inverse: FloatArray = np.asarray(q) * np.array([1.0, -1.0, -1.0, -1.0])
+    return inverse
 
 
 def rotation_vector(q: FloatArray) -> FloatArray:
@@ -42,7 +43,7 @@ def rotation_vector(q: FloatArray) -> FloatArray:
 def euler(q: FloatArray) -> FloatArray:
     """Roll, pitch, yaw [rad] (n, 3) of q_nb (n, 4)."""
     w, x, y, z = np.moveaxis(np.asarray(q), -1, 0)
-    return np.stack(
+    angles: FloatArray = np.stack(
         [
             np.arctan2(2.0 * (y * z + w * x), w * w - x * x - y * y + z * z),
             np.arcsin(np.clip(2.0 * (w * y - x * z), -1.0, 1.0)),
@@ -50,6 +51,7 @@ def euler(q: FloatArray) -> FloatArray:
         ],
         axis=-1,
     )
+    return angles
 
 
 def slerp(t: FloatArray, tq: FloatArray, q: FloatArray) -> FloatArray:

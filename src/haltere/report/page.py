@@ -8,6 +8,7 @@ from importlib import resources
 from haltere._version import __version__
 from haltere.flight.log import FlightLog
 from haltere.flight.solution import Solution
+from haltere.metrics.summary import finite
 from haltere.report import overview, sections, tables
 from haltere.report.context import Context, Section
 from haltere.report.panels import Figure
@@ -79,7 +80,7 @@ def _assemble(c: Context, command: str | None) -> str:
     body = [_header(c), _first(c, track, figures), *(_section(s, figures) for s in shown)]
     links = " ".join(f'<a href="#{s.key}">{escape(s.title)}</a>' for s in (track, *shown))
     name = c.flight.meta.name or "flight"
-    numbers = to_json({"colours": colours(), "arrays": c.pool.arrays, "figures": figures})
+    numbers = to_json({"colours": colours(), "arrays": c.pool.arrays, "figures": finite(figures)})
     return "\n".join(
         [
             '<!DOCTYPE html>\n<html lang="en">\n<head>\n<meta charset="utf-8">',

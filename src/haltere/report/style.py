@@ -17,7 +17,7 @@ COLOURS: dict[str, tuple[str, str]] = {
     "imu": ("#4a5a78", "#9fb3d9"),
     "assumed": ("#6f757d", "#a4abb5"),
     "refused": ("#cf1f2e", "#ff6b74"),
-    "deweighted": ("#b98900", "#f2c43d"),
+    "deweighted": ("#7d5f00", "#fff176"),
     "event": ("#a8137a", "#ff85d0"),
     "limit": ("#7d848d", "#8d949e"),
     "good": ("#1d7a34", "#57c873"),

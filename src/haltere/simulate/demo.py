@@ -114,7 +114,7 @@ def demo_flight(
     }
     return FlightLog(
         {
-            "imu": {"t": t} | {f"gyro_{a}": gyro[:, k] for k, a in enumerate("xyz")} | {f"accel_{a}": accel[:, k] for k, a in enumerate("xyz")},
+            "imu": {"t": t, **_xyz("gyro", gyro), **_xyz("accel", accel)},
             "magnetometer": {"t": t[every["mag"]]} | {f"mag_{a}": mag[:, k] for k, a in enumerate("xyz")},
             "gnss": {
                 "t": t[s], "lat": fix_lat, "lon": fix_lon, "alt": fix_alt, "vel_n": vel[:, 0], "vel_e": vel[:, 1], "vel_d": vel[:, 2],
@@ -129,6 +129,11 @@ def demo_flight(
         ),
         ["simulated: a smooth path with white noise and bias walks of known size"],
     )  # fmt: skip
+
+
+def _xyz(stem: str, vectors: NDArray[np.float64]) -> dict[str, NDArray[np.float64]]:
+    """Columns of vectors (n, 3) by axis."""
+    return {f"{stem}_{a}": vectors[:, k] for k, a in enumerate("xyz")}
 
 
 def _to_body(q: NDArray[np.float64], v_n: NDArray[np.float64]) -> NDArray[np.float64]:

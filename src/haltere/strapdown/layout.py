@@ -180,6 +180,7 @@ def layout(baro: int = 0) -> np.dtype[np.void]:
             ("f_raw", "f8", 3),
             ("anchor", "f8", 3),  # last position that something held
             ("yaw_corrected", "f8"),  # sum of the turns about the vertical that corrections made [rad]
+            ("baro_start", "f8"),  # barometric height minus height at the start [m]
             ("gravity", "f8"),
             ("origin", "f8", 3),
             ("has_origin", "i8"),
