@@ -20,8 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from haltere.aids.record import BAROMETER, GNSS_POSITION, GNSS_VELOCITY, MAGNETOMETER
-from haltere.core.earth import geodetic_from_local, gravity
-from haltere.core.rotation import quat_from_euler
+from haltere.core.earth import gravity
 from haltere.estimators.base import InitialState
 from haltere.flight import config as configuration
 from haltere.flight.config import Config

@@ -100,7 +100,7 @@ def test_help_names_every_verb_and_option(haltere: Caller) -> None:
         (["run"], "LOG"),
         (["fly"], "fly"),
         (["run", "x", "--ratte", "3"], "--ratte"),
-        (["run", "x", "--rate", "fast"], "fast"),
+        (["run", "x", "--rate", "fast"], "--rate"),
         (["convert", "x"], "DIR"),
     ],
 )

@@ -209,7 +209,17 @@ def test_barometer_row() -> None:
     H = derivative(s, lambda x: predicted(barometer.offer(x, prm, m, buffer())), 16)
     np.testing.assert_allclose(dense(offer[5][:1], 16), H, atol=1e-9)
     assert offer[4][0] == 1.5**2
-    assert barometer.offer(state(np.random.default_rng(2), 0), prm, m, buffer())[0] == 0  # no offset, no barometer
+
+
+def test_barometer_row_without_offset_state() -> None:
+    s, prm = state(np.random.default_rng(2), 0), parameters()
+    s["baro_start"] = 4.0
+    m = measurement((650.0, NAN, NAN))
+    offer = barometer.offer(s, prm, m, buffer())
+    assert (offer[0], offer[2][0]) == (1, 50.0)
+    assert offer[3][0] == pytest.approx(-float(s["p"][2]) + 4.0)
+    H = derivative(s, lambda x: predicted(barometer.offer(x, prm, m, buffer())), 15)
+    np.testing.assert_allclose(dense(offer[5][:1], 15), H, atol=1e-9)
 
 
 def test_first_barometer_sample_sets_the_offset() -> None:

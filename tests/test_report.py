@@ -400,7 +400,8 @@ def browse(tmp_path_factory: pytest.TempPathFactory) -> Callable[..., dict[str, 
         result = subprocess.run(
             [
                 program, "--headless", "--no-sandbox", "--disable-gpu", "--disable-quic", "--no-first-run",
-                "--disable-background-networking", "--disable-component-update", "--disable-sync", f"--user-data-dir={folder / 'profile'}", f"--window-size={size}",
+                "--disable-background-networking", "--disable-component-update", "--disable-sync",
+                f"--user-data-dir={folder / 'profile'}", f"--window-size={size}",
                 "--virtual-time-budget=20000", *options, "--dump-dom", file.as_uri(),
             ],
             capture_output=True, text=True, check=False, timeout=120,

@@ -15,10 +15,11 @@ from pathlib import Path
 from typing import TypeVar, cast
 
 import numpy as np
+from numpy.typing import NDArray
 
 F = TypeVar("F", bound=Callable[..., object])
 
-__all__ = ["COMPILED", "cache_folder", "constant", "entry", "jit"]
+__all__ = ["COMPILED", "as_records", "cache_folder", "constant", "entry", "jit"]
 
 #: False under ``HALTERE_JIT=0``.
 COMPILED = os.environ.get("HALTERE_JIT", "1") != "0"
@@ -31,6 +32,11 @@ _KERNEL_ROOMS = ("core", "filter", "strapdown", "aids", "diagnosis", "estimators
 def constant(value: int) -> int:
     """Integer for use in kernels that is no literal: of every plain integer argument a version of its own would be compiled."""
     return cast(int, np.int64(value))
+
+
+def as_records(array: NDArray[np.void]) -> NDArray[np.void]:
+    """The same structured array in the form that kernels reach by attribute: itself compiled, a record array in plain Python."""
+    return array if COMPILED else array.view(np.recarray)
 
 
 def cache_folder() -> Path:

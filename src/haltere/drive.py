@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from haltere._jit import as_records
 from haltere.aids.record import AID_RECORD, COMPONENTS, EVENTS, N_QUEUED, REASONS, SENSORS, STATUSES, YAW_BANK
 from haltere.errors import HaltereError, UsageError
 from haltere.estimators import step as kernels
@@ -135,7 +136,7 @@ def _loop(
     width = int(kernels.row_width(S["baro"].shape[1]))
     columns = np.empty((width, len(t)))
     chunk = np.empty((CHUNK + 4 * IMU_CAPACITY, width))
-    aids = np.empty(AID_ROOM, AID_RECORD)
+    aids = as_records(np.empty(AID_ROOM, AID_RECORD))
     parts: list[NDArray[np.void]] = []
     events: list[dict[str, Any]] = []
     filled = 0
@@ -170,9 +171,10 @@ def _drain(S: NDArray[np.void], aids: NDArray[np.void], parts: list[NDArray[np.v
 
 
 def _event(kind: str, sensor: str, t: float, value: float, bank: bool) -> dict[str, Any]:
+    how = {1: "at rest", 2: "in motion, from GNSS velocity", 3: "from gravity alone", 4: "in motion, from two turns of GNSS velocity"}
     evidence = {
-        "aligned": "initial alignment " + {1: "at rest", 2: "in motion, from GNSS velocity", 3: "from gravity alone"}.get(int(value), ""),
-        "realigned": "aligned anew " + {1: "at rest", 2: "in motion, from GNSS velocity", 3: "from gravity alone"}.get(int(value), ""),
+        "aligned": f"initial alignment {how.get(int(value), '')}",
+        "realigned": f"aligned anew {how.get(int(value), '')}",
         "reset": f"yaw set from GNSS velocity, turned by {math.degrees(value):.0f} deg" if bank else "first measurement sets the state",
         "timeout": f"refused for {value:.1f} s, let in again at the gate's edge",
         "gap": f"{value:.2f} s without IMU samples",
@@ -228,6 +230,9 @@ def _euler_sd(q: FloatArray, P: FloatArray) -> tuple[FloatArray, FloatArray, Flo
     k = sin_pitch / cos2
     roll = P[0] + 2.0 * k * (P[1] * s2 + P[2] * c2) + k * k * p_s
     pitch = (P[3] * c2 * c2 - 2.0 * P[4] * s2 * c2 + P[5] * s2 * s2) / cos2
+    pole = cos2 <= 1e-8  # there roll and yaw are one angle, and the first order has ended
+    roll, yaw = np.where(pole, math.pi**2, roll), np.where(pole, math.pi**2, yaw)
+    pitch = np.where(pole, 0.5 * (P[3] + P[5]), pitch)
     sd = [np.minimum(np.sqrt(np.maximum(v, 0.0)), math.pi) for v in (roll, pitch, yaw)]
     return sd[0], sd[1], sd[2]
 

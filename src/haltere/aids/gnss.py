@@ -7,7 +7,7 @@ from typing import Any
 
 from haltere._jit import jit
 from haltere.aids.fusing import NOTHING, RUNNING, THREE, Offer
-from haltere.aids.record import C_POS, C_VEL, E_RESET, FUSED, GNSS_POSITION, R_NONE, R_START, event, record
+from haltere.aids.record import BAROMETER, C_POS, C_VEL, E_RESET, FUSED, GNSS_POSITION, R_NONE, R_START, event, record
 from haltere.core.earth import gravity, local_from_geodetic
 from haltere.core.rotation import Mat, Vec, cross, dcm, dot, mat_vec
 from haltere.filter.update import NONE
@@ -102,6 +102,7 @@ def start_position(s: Any, prm: Any, m: Any, aids: Any) -> None:
             P[j, 6 + i] = 0.0
         P[6 + i, 6 + i] = r[i]
         record(s, aids, m.t, GNSS_POSITION, C_POS + i, z[i], 0.0, math.sqrt(r[i]), 0.0, 1.0, FUSED, R_START)
+    s.aid[BAROMETER].started = 0  # its offset hangs on the height that has just been set
     event(s, m.t, E_RESET, GNSS_POSITION, 0.0)
 
 

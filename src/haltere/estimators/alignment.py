@@ -27,6 +27,7 @@ from haltere.aids.record import (
 )
 from haltere.core.rotation import (
     Vec,
+    cross,
     dcm,
     dot,
     euler,
@@ -36,6 +37,7 @@ from haltere.core.rotation import (
     quat_from_rotvec,
     quat_mul,
     quat_unit,
+    scale,
     tmat_vec,
     triad,
     wrap,
@@ -45,9 +47,13 @@ from haltere.filter.queue import pop_due
 
 __all__ = ["AT_REST", "GRAVITY_ONLY", "IN_MOTION", "begin", "gather", "level_and_compass"]
 
-AT_REST, IN_MOTION, GRAVITY_ONLY = (constant(i) for i in (1, 2, 3))
+AT_REST, IN_MOTION, GRAVITY_ONLY, TWO_SPANS = (constant(i) for i in (1, 2, 3, 4))
 #: Longest wait [s] for a compass at rest, and for GNSS or rest before gravity alone must do.
 WAIT_COMPASS, WAIT_GRAVITY = 2.0, 5.0
+#: Without a compass an acceleration turns into tilt with the unknown yaw: wait for one below this [m/s^2], but no longer than [s].
+GENTLE, WAIT_GENTLE = 2.0, 20.0
+#: Two spans whose specific forces differ in direction (sine) give yaw too, when they are no further apart than this [s].
+SPREAD, REF_MAX, YAW_TWO_SPANS = 0.25, 8.0, math.radians(15.0)
 #: Length of the span [s] over which motion is compared, and after which it is given up.
 SPAN, SPAN_MAX = 1.0, 3.0
 
@@ -56,6 +62,8 @@ SPAN, SPAN_MAX = 1.0, 3.0
 def open_span(s: Any, t: float) -> None:
     """Begin to integrate rotation, specific force and field from here."""
     a = s.align
+    ref = tmat_vec(dcm((a.q[0], a.q[1], a.q[2], a.q[3])), (a.ref_f_b[0], a.ref_f_b[1], a.ref_f_b[2]))
+    a.ref_f_b[0], a.ref_f_b[1], a.ref_f_b[2] = ref
     a.open, a.t_span, a.n_m = 1, t, 0.0
     a.q[0], a.q[1], a.q[2], a.q[3] = 1.0, 0.0, 0.0, 0.0
     for i in range(3):
@@ -69,6 +77,8 @@ def begin(s: Any, t: float) -> None:
     s.t = t
     s.phase = 1
     a.t_first, a.t_gnss_v, a.t_gnss_p, a.t_baro, a.n_baro, a.open = t, -1e9, -1e9, -1e9, 0.0, 0
+    a.t_ref = -1e9
+    a.q[0], a.q[1], a.q[2], a.q[3] = 1.0, 0.0, 0.0, 0.0
     for i in range(3):
         a.gnss_v[i] = 0.0
     for k in range(len(s.aid)):
@@ -139,25 +149,27 @@ def level_and_compass(s: Any, prm: Any, f_b: Vec, a_n: Vec, m_b: Vec, has_m: boo
     reference_b = (1.0, 0.0, 0.0) if abs(f_b[0]) < 0.9 * norm(f_b) else (0.0, 1.0, 0.0)
     q = triad(f_n, (1.0, 0.0, 0.0), f_b, reference_b)
     roll, pitch, _ = euler(q)
-    if norm(a_n) < 1e-9:
+    moves = norm(a_n) > 1e-9
+    if not moves:
         q = quat_from_euler(roll, pitch, 0.0)
     passed = False
-    if has_m and norm(m_b) > 0.0:
+    if has_m and norm(m_b) > 0.0 and not (s.has_field == 0 and moves):  # an unknown field is learnt where f is vertical only
         mu = mat_vec(dcm(q), m_b)
         along = dot(mu, f_n) / norm(f_n)
         across = math.sqrt(max(0.0, dot(mu, mu) - along * along))
-        if s.has_field == 0 and across > 0.0:
+        if s.has_field == 0:
             learn_field(s, (across, 0.0, -along), s.field[0])
-        dip = math.atan2(-along, across)
-        passed = (
-            abs(norm(m_b) / s.field[2] - 1.0) < prm.field_tolerance_strength
-            and abs(dip - s.field[1]) < prm.field_tolerance_dip
-            and across > 0.2 * s.field[2] * math.cos(s.field[1])
-        )
-        # with motion the field must be compared across f_n, not across the vertical
         d, i = s.field[0], s.field[1]
         h = (math.cos(i) * math.cos(d), math.cos(i) * math.sin(d), math.sin(i))
-        if norm(a_n) < 1e-9:
+        # the angle between field and specific force is the same in both frames, whatever the attitude; at rest it is the dip
+        h_along = dot(h, f_n) / norm(f_n)
+        expected = math.atan2(-h_along, math.sqrt(max(0.0, 1.0 - h_along * h_along)))
+        passed = (
+            abs(norm(m_b) / s.field[2] - 1.0) < prm.field_tolerance_strength
+            and abs(math.atan2(-along, across) - expected) < prm.field_tolerance_dip
+            and across > 0.2 * s.field[2] * math.cos(expected)
+        )
+        if not moves:
             q = quat_from_euler(roll, pitch, wrap(d - math.atan2(mu[1], mu[0])))
         elif across > 0.0:
             q = triad(f_n, h, f_b, m_b)
@@ -173,6 +185,10 @@ def start(s: Any, prm: Any, kind: int, f_b: Vec, a_n: Vec) -> None:
     k = 1.0 / max(a.n_m, 1.0)
     m_b = tmat_vec(Cs, (k * a.m[0], k * a.m[1], k * a.m[2]))
     q0, q1, q2, q3, passed = level_and_compass(s, prm, f_b, a_n, m_b, has_m)
+    if kind == TWO_SPANS:
+        ref_b = tmat_vec(Cs, (a.ref_f_b[0], a.ref_f_b[1], a.ref_f_b[2]))
+        ref_n = (a.ref_f_n[0], a.ref_f_n[1], a.ref_f_n[2])
+        q0, q1, q2, q3 = triad((a_n[0], a_n[1], a_n[2] - s.gravity), ref_n, f_b, ref_b)
     s.q[0], s.q[1], s.q[2], s.q[3] = q0, q1, q2, q3
     P = s.P
     n = s.P.shape[0]
@@ -180,10 +196,13 @@ def start(s: Any, prm: Any, kind: int, f_b: Vec, a_n: Vec) -> None:
         s.dx[i] = 0.0
         for j in range(n):
             P[i, j] = 0.0
+    known = passed or kind == TWO_SPANS
     d = dcm((q0, q1, q2, q3))[2]
+    if not known:  # without a compass the turn about the specific force is unknown; at rest that is the vertical
+        d = scale(f_b, 1.0 / norm(f_b))
     tilt = prm.init_tilt_rest if kind == AT_REST else prm.init_tilt_motion
     tilt2 = tilt * tilt + (prm.init_accel_bias / s.gravity) ** 2
-    yaw2 = (prm.init_yaw_compass if passed else prm.init_yaw_unknown) ** 2
+    yaw2 = (prm.init_yaw_compass if passed else (YAW_TWO_SPANS if known else prm.init_yaw_unknown)) ** 2
     for i in range(3):
         for j in range(3):
             P[i, j] = (yaw2 - tilt2) * d[i] * d[j]
@@ -216,7 +235,7 @@ def start(s: Any, prm: Any, kind: int, f_b: Vec, a_n: Vec) -> None:
     s.aid[GNSS_VELOCITY].started = 1 if recent_v else 0
     s.aid[GNSS_POSITION].started = 1 if recent_p else 0
     s.aid[BAROMETER].started = 1 if s.t - a.t_baro < 2.0 else 0
-    s.aid[MAGNETOMETER].started = RUNNING if passed else (DISTRUSTED if has_m else 0)
+    s.aid[MAGNETOMETER].started = RUNNING if passed else (DISTRUSTED if has_m and s.has_field == 1 else 0)
     a.kind = kind
     s.phase = 2
     s.t_aligned = s.t
@@ -254,19 +273,32 @@ def gather(s: Any, prm: Any, rotation: Vec, dv: Vec, dt: float) -> None:
     waited = s.t - a.t_first
     # at rest: the last second is still, GNSS does not contradict, and the compass had time to speak
     compass_there = prm.aid_magnetometer == 0.0 or a.n_m > 0.0 or waited > WAIT_COMPASS
-    if s.rest.still == 1 and not (gnss_recent and gnss_speed > 1.0 + 3.0 * a.gnss_v_sd[0]) and compass_there:
+    at_rest = s.rest.still == 1 and not (gnss_recent and gnss_speed > 0.5 + 2.0 * a.gnss_v_sd[0])
+    if at_rest and compass_there:
         start(s, prm, AT_REST, (s.rest.mean_f[0], s.rest.mean_f[1], s.rest.mean_f[2]), (0.0, 0.0, 0.0))
         return
     if not judged:
         return
     span = s.t - a.t_span
-    if fresh and span >= SPAN and span <= SPAN_MAX and s.rest.still == 0:
+    if fresh and span >= SPAN and span <= SPAN_MAX and not at_rest:
         k = 1.0 / span
         f_b = tmat_vec(dcm(q), (k * a.f[0], k * a.f[1], k * a.f[2]))
         a_n = (k * (a.gnss_v[0] - a.v[0]), k * (a.gnss_v[1] - a.v[1]), k * (a.gnss_v[2] - a.v[2]))
-        if a.open == 2 and norm(f_b) > 0.3 * s.gravity and compass_there:
+        gentle = (a.n_m > 0.0 and s.has_field == 1) or norm(a_n) < GENTLE or waited > WAIT_GENTLE
+        if a.open == 2 and norm(f_b) > 0.3 * s.gravity and compass_there and gentle:
             start(s, prm, IN_MOTION, f_b, a_n)
             return
+        if a.open == 2 and compass_there:
+            f_n = (a_n[0], a_n[1], a_n[2] - s.gravity)
+            ref_n = (a.ref_f_n[0], a.ref_f_n[1], a.ref_f_n[2])
+            if s.t - a.t_ref < REF_MAX and norm(cross(f_n, ref_n)) > SPREAD * norm(f_n) * norm(ref_n):
+                start(s, prm, TWO_SPANS, f_b, a_n)
+                return
+            if s.t - a.t_ref > 0.5 * REF_MAX:
+                now_b = mat_vec(dcm(q), f_b)
+                for i in range(3):
+                    a.ref_f_b[i], a.ref_f_n[i] = now_b[i], f_n[i]
+                a.t_ref = s.t
         open_span(s, s.t)
         a.open = 2
     elif fresh and a.open == 1:  # a span for motion begins at a GNSS velocity

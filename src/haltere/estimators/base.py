@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from haltere._jit import as_records
 from haltere.aids.record import AID_RECORD, BAROMETER, GNSS_POSITION, GNSS_VELOCITY, MAGNETOMETER
 from haltere.core.earth import STANDARD_GRAVITY, gravity
 from haltere.errors import HaltereError, UsageError
@@ -104,7 +105,7 @@ class InitialState:
 
 def new_state(config: Config, initial: InitialState | None = None) -> NDArray[np.void]:
     """State record, one element, that has seen nothing yet."""
-    record = np.zeros(1, layout(1 if config["baro.offset"] == "on" else 0))
+    record = as_records(np.zeros(1, layout(1 if config["baro.offset"] == "on" else 0)))
     record["q"][0, 0] = 1.0
     home = (config.number("home.lat"), config.number("home.lon"), config.number("home.alt"))
     record["gravity"] = STANDARD_GRAVITY
@@ -184,7 +185,7 @@ class Estimator:
             self.config = configuration.resolve(name, "default", config or {}, "Estimator")
         self._S = new_state(self.config, initial)
         self._prm = parameters(self.config)
-        self._aids = np.empty(4096, AID_RECORD)
+        self._aids = as_records(np.empty(4096, AID_RECORD))
         self._now = np.zeros(11)
         self._view = State(self._S)
 

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from haltere._jit import entry
+from haltere._jit import as_records, entry
 from haltere.aids.record import BAROMETER, GNSS_POSITION, GNSS_VELOCITY, MAGNETOMETER
 from haltere.core.earth import pressure_altitude
 from haltere.core.rotation import Quat, dcm, mat_vec, quat_unit
@@ -103,7 +103,7 @@ def horizon(config: Config) -> float:
 
 def parameters(config: Config) -> NDArray[np.void]:
     """Parameter record, one element, of a configuration."""
-    record = np.zeros(1, PARAMETERS)
+    record = as_records(np.zeros(1, PARAMETERS))
     for name in PARAMETERS.names or ():
         if name in ("horizon", "covariance_interval", "imu_mean"):
             continue

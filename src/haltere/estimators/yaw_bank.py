@@ -11,7 +11,7 @@ import math
 from typing import Any
 
 from haltere._jit import jit
-from haltere.aids.fusing import DISTRUSTED
+from haltere.aids.fusing import DISTRUSTED, RUNNING
 from haltere.aids.magnetometer import reset_yaw, yaw_variance
 from haltere.aids.record import E_RESET, GNSS_VELOCITY, MAGNETOMETER, YAW_BANK, event
 from haltere.core.rotation import dcm, wrap
@@ -71,15 +71,17 @@ def estimate(s: Any) -> tuple[float, float]:
 
 
 @jit
-def one_hypothesis(b: Any, i: int, z0: float, z1: float, dt: float, r: float) -> float:
-    """Predict one hypothesis over the interval and update it with the velocity; return the likelihood of the innovation."""
+def one_hypothesis(b: Any, i: int, z0: float, z1: float, dt: float, r: float, q: float) -> float:
+    """Predict one hypothesis over the interval and update it with the velocity; return the likelihood of the innovation.
+
+    ``r`` is the variance of the velocity, ``q`` what the interval adds to that of the increment.
+    """
     x, P = b.x[i], b.P[i]
     c, sn = math.cos(x[2]), math.sin(x[2])
     g0, g1 = -sn * b.dv[0] - c * b.dv[1], c * b.dv[0] - sn * b.dv[1]  # derivative of the turned increment against ε
     x[0] += c * b.dv[0] - sn * b.dv[1]
     x[1] += sn * b.dv[0] + c * b.dv[1]
     p02, p12, p22 = P[0, 2], P[1, 2], P[2, 2]
-    q = NOISE_V * NOISE_V * dt
     a00 = P[0, 0] + 2.0 * g0 * p02 + g0 * g0 * p22 + q
     a01 = P[0, 1] + g1 * p02 + g0 * p12 + g0 * g1 * p22
     a11 = P[1, 1] + 2.0 * g1 * p12 + g1 * g1 * p22 + q
@@ -121,7 +123,7 @@ def update(s: Any, z0: float, z1: float, r: float) -> None:
     """Take a GNSS velocity (north, east [m/s], variance) and, where it is called for, set the filter's yaw.
 
     Named conditions to take over: the bank agrees within ``SD_MAX``; velocity has changed lately; and the filter's yaw is
-    unknown, or is wrong by the bank while GNSS velocity has been refused.
+    unknown, or is wrong by the bank while no compass vouches for it or GNSS velocity has been refused.
     """
     b = s.yaw
     dt = s.t - b.t
@@ -135,9 +137,13 @@ def update(s: Any, z0: float, z1: float, r: float) -> None:
         b.n = 1
         return
     follow(s)
+    C = dcm((s.q[0], s.q[1], s.q[2], s.q[3]))
+    yaw2 = yaw_variance(s, C)
+    tilt2 = 0.5 * max(0.0, s.P[0, 0] + s.P[1, 1] + s.P[2, 2] - yaw2)
+    q = (NOISE_V * NOISE_V + s.gravity * s.gravity * tilt2) * dt  # a tilt error is a false acceleration, for about a second
     total = 0.0
     for i in range(HYPOTHESES):
-        b.w[i] *= one_hypothesis(b, i, z0, z1, dt, r)
+        b.w[i] *= one_hypothesis(b, i, z0, z1, dt, r, q)
         total += b.w[i]
     for i in range(HYPOTHESES):
         b.w[i] = max(b.w[i] / total, 1e-6) if total > 0.0 else 1.0 / HYPOTHESES
@@ -151,10 +157,11 @@ def update(s: Any, z0: float, z1: float, r: float) -> None:
     error, sd = estimate(s)
     if not moved or sd > SD_MAX:
         return
-    C = dcm((s.q[0], s.q[1], s.q[2], s.q[3]))
-    unknown = yaw_variance(s, C) > SD_UNKNOWN * SD_UNKNOWN
+    unknown = yaw2 > SD_UNKNOWN * SD_UNKNOWN
     refused = s.t - s.aid[GNSS_VELOCITY].t_passed > REFUSED
-    if unknown or (refused and abs(error) > max(ERROR_MIN, 3.0 * sd)):
+    compass = s.aid[MAGNETOMETER].started == RUNNING and s.t - s.aid[MAGNETOMETER].t_passed < 1.0
+    contradicted = abs(error) > max(ERROR_MIN, 3.0 * sd) and (refused or not compass)
+    if unknown or contradicted:
         reset_yaw(s, error, max(sd, 0.5 * SD_MAX))
         follow(s)
         if abs(error) > ERROR_MIN:

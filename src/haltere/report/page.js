@@ -145,6 +145,8 @@
 
   const draw = async (div) => {
     const figure = page.figures[div.dataset.figure];
+    // A narrow legend takes more lines, which must not come off the panels.
+    if (innerWidth < 700) div.style.height = `${figure.height + 32}px`;
     await Plotly.newPlot(div, resolve(figure.traces), layoutOf(figure), configOf(figure));
     drawn.add(div);
     root.dataset.drawn = String(drawn.size);

@@ -161,7 +161,7 @@ def innovations(c: Context) -> Section:
         if not components:
             continue
         titles = [f"{COMPONENTS[k][0]} [{COMPONENTS[k][1]}]" for k in components]
-        panels = _panels(c, f"innovations_{sensor}", titles, 112 if sensor in SENSOR_COLOURS else 96)
+        panels = _panels(c, f"innovations_{sensor}", titles, 112 if sensor in SENSOR_COLOURS else 106)
         for k, component in enumerate(components):
             beyond += _innovation(c, panels, k, sensor, component)
         figure = panels.figure()

@@ -66,7 +66,7 @@ def consistency(c: Context) -> Section:
     rows: list[tuple[str, ...]] = [
         (
             escape(sensor_label(sensor)), f"{v['n']:,}", number(v["mean"]), f"{number(v['band'][0])} … {number(v['band'][1])}",
-            f"{v['rejected']:,}", f"{v['deweighted']:,}", escape(nis_in_words(v["mean"], v["band"])),
+            f"{v['rejected']:,}", f"{v['deweighted']:,}", escape(nis_in_words(sensor, v["mean"], v["band"])),
         )
         for sensor, v in ((s, nis[s]) for s in c.sensors if s in nis)
     ]  # fmt: skip

@@ -72,7 +72,8 @@ def verdict(c: Context) -> Verdict:
     broken = [e for e in solution.events if e["kind"] == "diverged"]
     lost = [d for d in discarded(summary) if d[2] > 0.05 * max(d[3], 1) and d[1] not in ("before alignment", "no 3-D fix")]
     drifting = "pos_n" in solution and not c.held_by_measurement
-    worst = 2 if by_level["bad"] or broken else 1 if by_level["doubtful"] or lost or drifting else 0
+    torn = [e for e in solution.events if e["kind"] == "gap" and (e.get("statistic") or 0.0) > 1.0]
+    worst = 2 if by_level["bad"] or broken else 1 if by_level["doubtful"] or lost or drifting or torn else 0
     if broken:
         headline = f"The filter broke down {count(len(broken), 'time')}: read what follows with that in mind."
     elif by_level["bad"] or by_level["doubtful"]:
@@ -80,6 +81,9 @@ def verdict(c: Context) -> Verdict:
         headline = f"Not all sensors fit: {_list(named)} {'disagree' if len(named) > 1 else 'disagrees'} with the rest."
     elif drifting:
         headline = "Rely on attitude only: no GNSS position was let in, so velocity and position are held by assumptions."
+    elif torn:
+        seconds = sum(float(e["statistic"]) for e in torn)
+        headline = f"The sensors agree, but the solution is interrupted: {seconds:.0f} s are without IMU samples."
     elif worst:
         headline = "The sensors agree, but a good part of the data could not be used."
     elif len(by_level["good"]) > 1:
@@ -99,7 +103,7 @@ def _list(words: list[str]) -> str:
 
 
 def _coverage(c: Context) -> str:
-    how = next((e["evidence"] for e in c.solution.events if e["kind"] == "aligned"), "it began from a given state")
+    how = next((e.get("evidence") or "aligned" for e in c.solution.events if e["kind"] == "aligned"), "it began from a given state")
     t = c.solution.t
     return (
         f"{c.solution.config.estimator} ran from t = {t[0]:.2f} s to {t[-1]:.2f} s ({count(len(t), 'row')}): {how}"
@@ -149,35 +153,34 @@ def _what_happened(c: Context) -> list[str]:
     return out
 
 
+#: Quantities by stem of their columns: word and unit.
+_VECTORS = (("vel", "velocity", "m/s"), ("pos", "position", "m"))
+_AXES = {"n": "north", "e": "east", "d": "down"}
+
+
+def _in_words(angles: dict[str, float], vectors: dict[str, float]) -> str:
+    """Angles [deg] by name, and components by column, as one phrase."""
+    parts = [", ".join(f"{name} {fixed(v)}°" for name, v in angles.items())] if angles else []
+    for stem, word, unit in _VECTORS:
+        axes = {a: vectors[f"{stem}_{a}"] for a in _AXES if f"{stem}_{a}" in vectors}
+        if len(axes) == 3:
+            parts.append(f"{word} {' / '.join(fixed(v) for v in axes.values())} {unit} (north / east / down)")
+        elif axes:
+            parts.append(f"{word} {', '.join(f'{_AXES[a]} {fixed(v)}' for a, v in axes.items())} {unit}")
+    return "; ".join(parts)
+
+
 def _quality(c: Context) -> list[str]:
     out = []
     for name, rows in c.solution.summary.get("errors", {}).items():
-        parts = []
-        angles = [(k, rows[f"{k}_deg"]["rms"]) for k in ("roll", "pitch", "yaw") if f"{k}_deg" in rows]
-        if angles:
-            parts.append(", ".join(f"{k} {fixed(v)}°" for k, v in angles))
-        for stem, word, unit in (("vel", "velocity", "m/s"), ("pos", "position", "m")):
-            axes = [rows[f"{stem}_{a}"]["rms"] for a in "ned" if f"{stem}_{a}" in rows]
-            if axes:
-                parts.append(f"{word} {' / '.join(fixed(v) for v in axes)} {unit}")
-        if parts:
-            what = (
-                "RMS error against truth (north / east / down)"
-                if name == "truth"
-                else f"RMS difference from the {name} solution (north / east / down; it is another estimate, no truth)"
-            )
-            out.append(f"{what}: {'; '.join(parts)}.")
-    sd = {
-        k: float(np.median(c.solution[f"sd_{k}"]))
-        for k in ("roll", "pitch", "yaw", "vel_n", "vel_e", "vel_d", "pos_n", "pos_e", "pos_d")
-        if f"sd_{k}" in c.solution
-    }
-    parts = [f"{k} {fixed(math.degrees(sd[k]))}°" for k in ("roll", "pitch", "yaw") if k in sd]
-    for stem, word, unit in (("vel", "velocity", "m/s"), ("pos", "position", "m")):
-        if f"{stem}_n" in sd:
-            parts.append(f"{word} {' / '.join(fixed(sd[f'{stem}_{a}']) for a in 'ned')} {unit}")
-    out.append(f"Stated 1σ, median over the flight: {', '.join(parts)}.")
-    return out
+        angles = {k: rows[f"{k}_deg"]["rms"] for k in ("roll", "pitch", "yaw") if f"{k}_deg" in rows}
+        words = _in_words(angles, {k: row["rms"] for k, row in rows.items()})
+        if words:
+            what = "RMS error against truth" if name == "truth" else f"RMS difference from the {name} solution (another estimate, no truth)"
+            out.append(f"{what}: {words}.")
+    sd = {k[3:]: float(np.median(v)) for k, v in c.solution.table.items() if k.startswith("sd_")}
+    words = _in_words({k: math.degrees(sd[k]) for k in ("roll", "pitch", "yaw") if k in sd}, sd)
+    return [*out, f"Stated 1σ, median over the flight: {words}."] if words else out
 
 
 def _left_out(summary: dict[str, Any]) -> list[str]:
@@ -195,8 +198,10 @@ def _left_out(summary: dict[str, Any]) -> list[str]:
     return [f"Discarded: {told}{others}."]
 
 
-def nis_in_words(mean: float | None, band: list[float]) -> str:
+def nis_in_words(sensor: str, mean: float | None, band: list[float]) -> str:
     """What the mean of the normalised innovations says of a sensor's noise."""
+    if sensor.startswith(("zero", "fake")):
+        return "an assumption, not a measurement: may be small"
     if mean is None:
         return "none was used"
     if mean > band[1]:
@@ -228,7 +233,7 @@ def facts(c: Context) -> list[tuple[str, str]]:
     if c.origin:
         add("origin", f"{c.origin[0]:.7f}°, {c.origin[1]:.7f}°, {c.origin[2]:.1f} m above mean sea level")
     i = int(np.argmax(c.tilt))
-    add("largest tilt", f"{c.tilt[i]:.0f}° at t = {solution.t[i]:.1f} s")
+    add("largest tilt", f"{c.tilt[i]:.1f}° at t = {solution.t[i]:.1f} s")
     if "vel_n" in solution and c.held_by_measurement:
         ground = np.hypot(solution["vel_n"], solution["vel_e"])
         k = int(np.argmax(ground))

@@ -58,8 +58,9 @@ def random_path(rng: np.random.Generator, duration: float, rest: float, extent: 
         Knot times (k,), positions NED (k, 3) [m], yaw (k,) [rad].
     """
     spacing = 5.0
-    n = max(9, int((duration - rest) / spacing) + 1)
-    moving = rest + spacing * np.arange(n, dtype=np.float64)
+    early = 0 if rest > 0.0 else 3  # a flight that begins in the air has begun some way-points before
+    n = max(9, int((duration - rest) / spacing) + 1) + early
+    moving = rest + spacing * (np.arange(n, dtype=np.float64) - early)
     pos = np.column_stack([rng.uniform(-extent, extent, n), rng.uniform(-extent, extent, n), rng.uniform(-30.0, -10.0, n)])
     yaw = np.asarray(np.cumsum(rng.uniform(-1.2, 1.2, n)), dtype=np.float64)
     if rest > 0.0:
@@ -88,7 +89,7 @@ def fly(t: FloatArray, knots: FloatArray, pos_n: FloatArray, yaw: FloatArray, gr
     """
     still = t < knots[0]
     s = np.maximum(t, knots[0])
-    p, heading = _spline(knots, pos_n, bool(still.any())), _spline(knots, yaw, bool(still.any()))
+    p, heading = _spline(knots, pos_n), _spline(knots, yaw)
     moves = np.where(still, 0.0, 1.0)[:, None]
     pos, vel, acc, jerk = p(s), moves * p(s, 1), moves * p(s, 2), moves * p(s, 3)
     psi, psi_dot = heading(s), moves[:, 0] * heading(s, 1)
@@ -111,10 +112,8 @@ def fly(t: FloatArray, knots: FloatArray, pos_n: FloatArray, yaw: FloatArray, gr
     return Motion(t, pos, vel, acc, _quaternions(C), gyro, np.einsum("nij,ni->nj", C, f_n))
 
 
-def _spline(knots: FloatArray, values: FloatArray, from_rest: bool) -> BSpline:
-    """Spline of degree seven; from rest its first three derivatives begin and end at zero."""
-    if not from_rest:
-        return make_interp_spline(knots, values, k=7)
+def _spline(knots: FloatArray, values: FloatArray) -> BSpline:
+    """Spline of degree seven whose first three derivatives begin and end at zero."""
     zero = np.zeros(values.shape[1:])
     ends = [(order, zero) for order in (1, 2, 3)]
     return make_interp_spline(knots, values, k=7, bc_type=(ends, ends))

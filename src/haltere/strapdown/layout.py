@@ -94,6 +94,9 @@ ALIGNMENT = _record(
     ("m", "f8", 3),  # sum of magnetometer samples, likewise
     ("n_m", "f8"),
     ("v", "f8", 3),  # GNSS velocity at the start of the span
+    ("ref_f_b", "f8", 3),  # specific force of an earlier span, in the body frame at the start of this one, and in NED
+    ("ref_f_n", "f8", 3),
+    ("t_ref", "f8"),
     ("gnss_v", "f8", 3),
     ("gnss_v_sd", "f8", 3),
     ("t_gnss_v", "f8"),
