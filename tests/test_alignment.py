@@ -15,7 +15,7 @@ from haltere.aids.record import BAROMETER, FUSED
 from haltere.drive import run
 from haltere.errors import HaltereError
 from haltere.estimators.alignment import AT_REST, GRAVITY_ONLY, IN_MOTION, TWO_SPANS, level_and_compass
-from haltere.estimators.base import Estimator, State
+from haltere.estimators.base import Estimator, InitialState, State
 from haltere.flight.local import geodetic_from_local
 from haltere.flight.log import FlightLog, FlightMeta
 from haltere.flight.solution import Solution
@@ -252,6 +252,25 @@ def test_smooth_drift_that_gnss_sees_is_not_rest(accuracy: float | None) -> None
     assert solution["vel_n"][-1] == pytest.approx(2.0, abs=1.0)
 
 
+@pytest.mark.parametrize("accuracy", [0.05, 0.1, 0.2, 0.5])
+def test_gentle_departure_that_gnss_sees_ends_rest(accuracy: float) -> None:
+    """Six seconds at rest, then 0.3 m/s² up to 3 m/s, as smooth as rest: every fix says so, however good the receiver."""
+    rng = np.random.default_rng(9)
+    t, tg = np.arange(0.0, 40.0, 0.01), np.arange(0.0, 40.0, 0.2)
+    speed = np.clip(0.3 * (t - 6.0), 0.0, 3.0)
+    accel = np.column_stack([np.gradient(speed, 0.01), 0.0 * t, 0.0 * t - G]) + 0.1 * rng.standard_normal((len(t), 3))
+    way, zero = np.interp(tg, t, np.cumsum(speed) * 0.01), np.zeros(len(tg))
+    lat, lon, alt = geodetic_from_local(way, zero, zero, 46.8, 8.2, 600.0)
+    gnss = {"t": tg, "lat": lat, "lon": lon, "alt": alt, "s_acc": zero + accuracy}
+    gnss |= {
+        f"vel_{a}": v + 0.7 * accuracy * rng.standard_normal(len(tg)) for a, v in (("n", np.interp(tg, t, speed)), ("e", zero), ("d", zero))
+    }
+    imu = {"t": t} | columns("gyro", 0.008 * rng.standard_normal((len(t), 3))) | columns("accel", accel)
+    solution = run(FlightLog({"imu": imu, "gnss": gnss}))
+    assert flight_kind(solution) == AT_REST
+    assert solution["vel_n"][-1] == pytest.approx(3.0, abs=1.0)
+
+
 # Yaw without a compass, and against a wrong one
 
 
@@ -409,6 +428,19 @@ def test_first_fix_after_alignment_leaves_the_barometer_trusted() -> None:
     after = records[(records["sensor"] == BAROMETER) & (records["t"] > 10.5)]
     assert len(after) > 200
     assert (after["status"] == FUSED).mean() > 0.95
+
+
+@pytest.mark.parametrize("begin", [-10.0, 0.0, 1e6])
+def test_a_given_state_takes_the_place_of_alignment_at_any_time(begin: float) -> None:
+    """At rest from a given state, five seconds, also at times before zero: the aids of rest hold velocity within theirs of 0.05 m/s."""
+    P = np.diag(np.repeat([0.05, 0.3, 1.0, 0.01, 0.2], 3) ** 2)
+    zero = np.zeros(3)
+    est = Estimator("ahrs", initial=InitialState(begin, np.array([1.0, 0.0, 0.0, 0.0]), zero, zero, zero, zero, P))
+    for k in range(500):
+        state = est.step(begin + 0.01 * k, (0.001 * (k % 3), 0.0, 0.0), (0.0, 0.0, -G + 0.01 * (k % 2)))
+        assert state.aligned
+    assert np.sqrt(np.diag(state.P)[3:6]).max() < 0.1
+    assert len(est.records()) > 100
 
 
 def test_alignment_begins_anew_after_a_long_gap() -> None:

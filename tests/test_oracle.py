@@ -5,14 +5,13 @@ from __future__ import annotations
 import os
 import subprocess
 import sys
-from pathlib import Path
 
 import numpy as np
 import pytest
 
 from haltere._jit import COMPILED
 
-#: Runs both estimators over six seconds that hold alignment at rest, take-off and every sensor, and once online; writes all it got.
+#: Runs both estimators over five seconds that hold alignment at rest, take-off and every sensor, and once online; writes all it got.
 SCRIPT = """
 import sys
 import numpy as np
@@ -23,7 +22,7 @@ from haltere.flight.log import FlightLog
 from haltere.simulate import demo_flight
 
 demo = demo_flight(3, 24.0, imu_rate=100.0)
-flight = FlightLog({k: s.where((s.t >= 2.5) & (s.t <= 8.5)) for k, s in demo.streams.items()}, demo.meta)
+flight = FlightLog({k: s.where((s.t >= 2.5) & (s.t <= 7.5)) for k, s in demo.streams.items()}, demo.meta)
 out = {"compiled": np.array(COMPILED)}
 for name, options in (
     ("navigator", {}),
@@ -54,20 +53,27 @@ np.savez(sys.argv[1], **out)
 def twins(tmp_path_factory: pytest.TempPathFactory) -> tuple[dict[str, np.ndarray], dict[str, np.ndarray]]:
     """What the compiled kernels give, and what plain Python gives."""
     folder = tmp_path_factory.mktemp("twin")
-    got = []
-    for name, value in (("compiled", os.environ.get("HALTERE_JIT", "1") if COMPILED else "1"), ("plain", "0")):
-        file = folder / f"{name}.npz"
-        result = subprocess.run(
-            [sys.executable, "-c", SCRIPT, str(file)], capture_output=True, text=True, check=False, env={**os.environ, "HALTERE_JIT": value}
+    modes = {"compiled": os.environ.get("HALTERE_JIT", "1") if COMPILED else "1", "plain": "0"}
+    running = {
+        name: subprocess.Popen(
+            [sys.executable, "-c", SCRIPT, str(folder / f"{name}.npz")],
+            stderr=subprocess.PIPE,
+            text=True,
+            env={**os.environ, "HALTERE_JIT": mode},
         )
-        assert result.returncode == 0, f"HALTERE_JIT={value}: {result.stderr[-2000:]}"
-        with np.load(Path(file)) as data:
+        for name, mode in modes.items()
+    }
+    got = []
+    for name, process in running.items():
+        _, told = process.communicate()
+        assert process.returncode == 0, f"HALTERE_JIT={modes[name]}: {told[-2000:]}"
+        with np.load(folder / f"{name}.npz") as data:
             got.append({k: data[k] for k in data.files})
     return got[0], got[1]
 
 
 def test_plain_python_runs_the_same_kernels_to_the_same_numbers(twins: tuple[dict[str, np.ndarray], dict[str, np.ndarray]]) -> None:
-    """600 steps with 1e-16 a rounding; the filter forgets faster than they add up. Relative to the largest value of each column."""
+    """500 steps with 1e-16 a rounding; the filter forgets faster than they add up. Relative to the largest value of each column."""
     compiled, plain = twins
     assert bool(compiled.pop("compiled"))
     assert not bool(plain.pop("compiled"))
@@ -86,7 +92,7 @@ def test_plain_python_runs_the_same_kernels_to_the_same_numbers(twins: tuple[dic
 def test_the_twins_saw_every_sensor(twins: tuple[dict[str, np.ndarray], dict[str, np.ndarray]]) -> None:
     """The comparison is not of an idle filter."""
     plain = twins[1]
-    assert len(plain["navigator.t"]) > 400
+    assert len(plain["navigator.t"]) > 300
     assert set(plain["navigator.aid.sensor"]) >= {"gnss", "barometer", "magnetometer", "zero_velocity", "zero_rate"}
     assert set(plain["ahrs.aid.sensor"]) >= {"magnetometer", "fake_velocity", "fake_position"}
     assert "mag_x" in plain["late.aid.component"]

@@ -28,8 +28,9 @@ def project(s: Any, H: Row) -> None:
         u[j] = 0.0
     for c, h in H:
         h0, h1, h2 = h
-        for j in range(n):
-            u[j] += h0 * P[c, j] + h1 * P[c + 1, j] + h2 * P[c + 2, j]
+        if h0 != 0.0 or h1 != 0.0 or h2 != 0.0:
+            for j in range(n):
+                u[j] += h0 * P[c, j] + h1 * P[c + 1, j] + h2 * P[c + 2, j]
 
 
 @jit
@@ -47,6 +48,26 @@ def innovation(s: Any, H: Row, e: float) -> float:
     for c, h in H:
         e -= h[0] * s.dx[c] + h[1] * s.dx[c + 1] + h[2] * s.dx[c + 2]
     return e
+
+
+@jit
+def add_outer(s: Any, sign: float, a: Any, b: Any) -> None:
+    """P <- P ± a bᵀ, five rows at a time: a shorter loop body is unrolled into scalar code before it can become SIMD."""
+    P = s.P
+    n = s.P.shape[0]
+    for i in range(0, n - 4, 5):
+        a0, a1, a2, a3, a4 = sign * a[i], sign * a[i + 1], sign * a[i + 2], sign * a[i + 3], sign * a[i + 4]
+        for j in range(n):
+            bj = b[j]
+            P[i, j] += a0 * bj
+            P[i + 1, j] += a1 * bj
+            P[i + 2, j] += a2 * bj
+            P[i + 3, j] += a3 * bj
+            P[i + 4, j] += a4 * bj
+    for i in range(n - n % 5, n):
+        ai = sign * a[i]
+        for j in range(n):
+            P[i, j] += ai * b[j]
 
 
 @jit
@@ -70,20 +91,16 @@ def apply(s: Any, H: Row, r: float, e: float) -> None:
     P, u, k, dx = s.P, s.u, s.k, s.dx
     n = s.P.shape[0]
     for i in range(n):
-        ki = k[i]
-        dx[i] += ki * e
-        for j in range(n):
-            P[i, j] -= ki * u[j]
+        dx[i] += k[i] * e
+    add_outer(s, -1.0, k, u)
     for i in range(n):
         u[i] = r * k[i]
     for c, h in H:
         h0, h1, h2 = h
-        for i in range(n):
-            u[i] -= P[i, c] * h0 + P[i, c + 1] * h1 + P[i, c + 2] * h2
-    for i in range(n):
-        ui = u[i]
-        for j in range(n):
-            P[i, j] += ui * k[j]
+        if h0 != 0.0 or h1 != 0.0 or h2 != 0.0:
+            for i in range(n):
+                u[i] -= P[i, c] * h0 + P[i, c + 1] * h1 + P[i, c + 2] * h2
+    add_outer(s, 1.0, u, k)
 
 
 @jit
@@ -107,5 +124,6 @@ def column_of(s: Any, H: Row) -> None:
         k[i] = 0.0
     for c, h in H:
         h0, h1, h2 = h
-        for i in range(n):
-            k[i] += P[i, c] * h0 + P[i, c + 1] * h1 + P[i, c + 2] * h2
+        if h0 != 0.0 or h1 != 0.0 or h2 != 0.0:
+            for i in range(n):
+                k[i] += P[i, c] * h0 + P[i, c + 1] * h1 + P[i, c + 2] * h2

@@ -10,7 +10,7 @@ from typing import Any
 from haltere._jit import jit
 from haltere.core.rotation import Mat, Vec, cross, dcm, dot, mat_vec, quat_from_rotvec, quat_mul, quat_unit, rotvec_dcm
 
-__all__ = ["inject", "left_F", "mechanise", "predict", "transpose"]
+__all__ = ["inject", "left_F", "mechanise", "predict", "turn"]
 
 
 @jit
@@ -45,11 +45,13 @@ def mechanise(s: Any, rotation: Vec, dv_mid: Vec, dt: float) -> Mat:
 
 
 @jit
-def left_F(s: Any, D: Mat, A: Mat, B: Mat, dt: float) -> None:
-    """P <- Φ P, touching only the blocks of Φ that are not zero or one.
+def left_F(s: Any, j: int, D: Mat, A: Mat, B: Mat, dt: float) -> None:
+    """Column j of P <- Φ P, touching only the blocks of Φ that are not zero or one.
 
     Parameters
     ----------
+    j
+        Column. The loop over it is the caller's: with a length known there it becomes SIMD.
     D
         Φ_θθ = R(ω dt)ᵀ.
     A, B
@@ -58,31 +60,36 @@ def left_F(s: Any, D: Mat, A: Mat, B: Mat, dt: float) -> None:
         Interval [s].
     """
     P = s.P
-    for j in range(s.P.shape[0]):  # the long index outside: SIMD
-        t0, t1, t2 = P[0, j], P[1, j], P[2, j]
-        g0, g1, g2 = P[9, j], P[10, j], P[11, j]
-        b0, b1, b2 = P[12, j], P[13, j], P[14, j]
-        d0 = A[0][0] * t0 + A[0][1] * t1 + A[0][2] * t2 + B[0][0] * b0 + B[0][1] * b1 + B[0][2] * b2
-        d1 = A[1][0] * t0 + A[1][1] * t1 + A[1][2] * t2 + B[1][0] * b0 + B[1][1] * b1 + B[1][2] * b2
-        d2 = A[2][0] * t0 + A[2][1] * t1 + A[2][2] * t2 + B[2][0] * b0 + B[2][1] * b1 + B[2][2] * b2
-        P[6, j] += dt * (P[3, j] + 0.5 * d0)
-        P[7, j] += dt * (P[4, j] + 0.5 * d1)
-        P[8, j] += dt * (P[5, j] + 0.5 * d2)
-        P[3, j] += d0
-        P[4, j] += d1
-        P[5, j] += d2
-        P[0, j] = D[0][0] * t0 + D[0][1] * t1 + D[0][2] * t2 - dt * g0
-        P[1, j] = D[1][0] * t0 + D[1][1] * t1 + D[1][2] * t2 - dt * g1
-        P[2, j] = D[2][0] * t0 + D[2][1] * t1 + D[2][2] * t2 - dt * g2
+    t0, t1, t2 = P[0, j], P[1, j], P[2, j]
+    g0, g1, g2 = P[9, j], P[10, j], P[11, j]
+    b0, b1, b2 = P[12, j], P[13, j], P[14, j]
+    d0 = A[0][0] * t0 + A[0][1] * t1 + A[0][2] * t2 + B[0][0] * b0 + B[0][1] * b1 + B[0][2] * b2
+    d1 = A[1][0] * t0 + A[1][1] * t1 + A[1][2] * t2 + B[1][0] * b0 + B[1][1] * b1 + B[1][2] * b2
+    d2 = A[2][0] * t0 + A[2][1] * t1 + A[2][2] * t2 + B[2][0] * b0 + B[2][1] * b1 + B[2][2] * b2
+    P[6, j] += dt * (P[3, j] + 0.5 * d0)
+    P[7, j] += dt * (P[4, j] + 0.5 * d1)
+    P[8, j] += dt * (P[5, j] + 0.5 * d2)
+    P[3, j] += d0
+    P[4, j] += d1
+    P[5, j] += d2
+    P[0, j] = D[0][0] * t0 + D[0][1] * t1 + D[0][2] * t2 - dt * g0
+    P[1, j] = D[1][0] * t0 + D[1][1] * t1 + D[1][2] * t2 - dt * g1
+    P[2, j] = D[2][0] * t0 + D[2][1] * t1 + D[2][2] * t2 - dt * g2
 
 
 @jit
-def transpose(s: Any) -> None:
-    """P <- Pᵀ in place."""
+def turn(s: Any) -> None:
+    """Between the two halves of Φ P Φᵀ: make the first nine columns of P those of (Φ P)ᵀ.
+
+    The other columns of Φᵀ are those of one, so that Φ P has the final values there, and the last rows theirs by symmetry.
+    """
     P = s.P
-    for i in range(s.P.shape[0]):
+    for i in range(9):
         for j in range(i):
             P[i, j], P[j, i] = P[j, i], P[i, j]
+    for i in range(9, s.P.shape[0]):
+        for j in range(9):
+            P[i, j] = P[j, i]
 
 
 @jit
@@ -115,9 +122,11 @@ def predict(s: Any, prm: Any, w: Vec, f: Vec, rotation: Vec, dv_mid: Vec, dt: fl
         (-dt * C[1][0], -dt * C[1][1], -dt * C[1][2]),
         (-dt * C[2][0], -dt * C[2][1], -dt * C[2][2]),
     )
-    left_F(s, Dt, A, B, dt)
-    transpose(s)
-    left_F(s, Dt, A, B, dt)
+    for j in range(s.P.shape[0]):
+        left_F(s, j, Dt, A, B, dt)
+    turn(s)
+    for j in range(9):
+        left_F(s, j, Dt, A, B, dt)
 
     P = s.P
     qg, qbg = prm.noise_gyro * prm.noise_gyro, prm.noise_gyro_bias * prm.noise_gyro_bias
