@@ -102,7 +102,7 @@ def run(
     prepared = time.perf_counter()
 
     S, prm = new_state(resolved, initial), parameters(resolved)
-    cov = np.empty((kernels.COVARIANCE_ROWS, int((t[-1] - t[0]) / 0.1) + 64))
+    cov = np.empty((kernels.COVARIANCE_ROWS, min(int((t[-1] - t[0]) / 0.1), len(t)) + 64))
     rows, aids_parts, events = _loop(S, prm, t, gyro, accel, offered, cov, progress)
     filtered = time.perf_counter()
 
@@ -171,10 +171,11 @@ def _drain(S: NDArray[np.void], aids: NDArray[np.void], parts: list[NDArray[np.v
 
 
 def _event(kind: str, sensor: str, t: float, value: float, bank: bool) -> dict[str, Any]:
+    code = int(value) if math.isfinite(value) else 0
     how = {1: "at rest", 2: "in motion, from GNSS velocity", 3: "from gravity alone", 4: "in motion, from two turns of GNSS velocity"}
     evidence = {
-        "aligned": f"initial alignment {how.get(int(value), '')}",
-        "realigned": f"aligned anew {how.get(int(value), '')}",
+        "aligned": f"initial alignment {how.get(code, '')}",
+        "realigned": f"aligned anew {how.get(code, '')}",
         "reset": f"yaw set from GNSS velocity, turned by {math.degrees(value):.0f} deg" if bank else "first measurement sets the state",
         "timeout": f"refused for {value:.1f} s, let in again at the gate's edge",
         "gap": f"{value:.2f} s without IMU samples",

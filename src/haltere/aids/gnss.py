@@ -15,6 +15,8 @@ from haltere.strapdown.layout import BG, POS, THETA, VEL
 
 __all__ = ["lever_rows", "offer_position", "offer_velocity", "position_observation", "position_variance", "velocity_variance"]
 
+#: Variance above which an accuracy says no more [m^2, m^2/s^2]: infinity would poison a gain.
+WORTHLESS = 1e8
 ONES = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
 
 
@@ -34,9 +36,9 @@ def velocity_variance(prm: Any, r: Any) -> Vec:
     default = prm.noise_gnss_velocity * prm.noise_gnss_velocity
     floor = prm.noise_gnss_velocity_min * prm.noise_gnss_velocity_min
     return (
-        max(r[0], floor) if r[0] >= 0.0 else default,
-        max(r[1], floor) if r[1] >= 0.0 else default,
-        max(r[2], floor) if r[2] >= 0.0 else default,
+        min(max(r[0], floor), WORTHLESS) if r[0] >= 0.0 else default,
+        min(max(r[1], floor), WORTHLESS) if r[1] >= 0.0 else default,
+        min(max(r[2], floor), WORTHLESS) if r[2] >= 0.0 else default,
     )
 
 
@@ -47,9 +49,9 @@ def position_variance(prm: Any, r: Any) -> Vec:
     default_d = prm.noise_gnss_altitude * prm.noise_gnss_altitude
     floor = prm.noise_gnss_position_min * prm.noise_gnss_position_min
     return (
-        max(r[0], floor) if r[0] >= 0.0 else default,
-        max(r[1], floor) if r[1] >= 0.0 else default,
-        max(r[2], floor) if r[2] >= 0.0 else default_d,
+        min(max(r[0], floor), WORTHLESS) if r[0] >= 0.0 else default,
+        min(max(r[1], floor), WORTHLESS) if r[1] >= 0.0 else default,
+        min(max(r[2], floor), WORTHLESS) if r[2] >= 0.0 else default_d,
     )
 
 

@@ -109,6 +109,6 @@ def at_rest(s: Any, prm: Any, w: Vec, f: Vec) -> bool:
     if gnss_speaks and speed2 < 0.3**2:
         m.moved = 0
     fix2 = s.yaw.z[0] ** 2 + s.yaw.z[1] ** 2  # the last GNSS velocity
-    denied = gnss_speaks and fix2 > (0.5 + 2.0 * math.sqrt(s.yaw.r)) ** 2
+    denied = s.t - s.aid[GNSS_VELOCITY].t_offered < 1.0 and fix2 > (0.5 + 2.0 * math.sqrt(s.yaw.r)) ** 2
     small = speed2 < 0.5**2 + 4.0 * sd2 and not denied
     return m.still == 1 and small and (gnss_speaks or m.moved == 0) and quiet(s, prm, w, f)

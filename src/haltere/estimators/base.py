@@ -152,6 +152,7 @@ def _begin_from(record: NDArray[np.void], initial: InitialState) -> None:
     record["aid"]["t_passed"][0] = initial.t
     record["aid"]["t_due"][0] = initial.t
     record["rest"]["t_block"] = initial.t
+    record["t_wake"] = initial.t
 
 
 class Estimator:

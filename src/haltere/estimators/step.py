@@ -29,6 +29,8 @@ __all__ = ["COVARIANCE_ROWS", "advance", "flush", "now", "offer", "row_width", "
 COVARIANCE_ROWS = 1 + 5 * 6 + 1
 #: Longest interval [s] bridged in one step, and longest gap [s] bridged at all.
 LONG_STEP, SUB_STEP = 0.1, 0.05
+#: No sensor measures more [rad/s, m/s^2].
+RATE_MAX, FORCE_MAX = 100.0, 500.0
 
 
 @entry
@@ -243,7 +245,7 @@ def step(S: Any, PRM: Any, t: float, gyro: Vec, accel: Vec, rows: Any, cov: Any,
     Returns
     -------
     int
-        0 taken; 1 not finite; 2 not after the sample before. The last two are counted and left out.
+        0 taken; 1 not finite; 2 not after the sample before; 3 beyond any sensor. All but 0 are counted and left out.
     """
     s, prm = S[0], PRM[0]
     if not (math.isfinite(t) and math.isfinite(gyro[0] + gyro[1] + gyro[2] + accel[0] + accel[1] + accel[2])):
@@ -252,6 +254,9 @@ def step(S: Any, PRM: Any, t: float, gyro: Vec, accel: Vec, rows: Any, cov: Any,
     if s.n_steps + s.imu_n > 0 and t <= s.t_newest:
         s.n_bad += 1
         return 2
+    if max(abs(gyro[0]), abs(gyro[1]), abs(gyro[2])) > RATE_MAX or max(abs(accel[0]), abs(accel[1]), abs(accel[2])) > FORCE_MAX:
+        s.n_bad += 1
+        return 3
     if s.imu_n == len(s.imu):  # no room: the horizon comes closer than configured
         s.n_ring_full += 1
         advance(s, prm, rows, cov, aids)

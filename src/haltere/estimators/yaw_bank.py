@@ -155,7 +155,7 @@ def update(s: Any, z0: float, z1: float, r: float) -> None:
     moved = math.hypot(z0 - b.slow[0], z1 - b.slow[1]) > CHANGE_MIN
 
     error, sd = estimate(s)
-    if not moved or sd > SD_MAX:
+    if not moved or not sd <= SD_MAX:
         return
     unknown = yaw2 > SD_UNKNOWN * SD_UNKNOWN
     refused = s.t - s.aid[GNSS_VELOCITY].t_passed > REFUSED

@@ -10,11 +10,14 @@ from numpy.typing import NDArray
 
 from haltere.errors import HaltereError
 from haltere.flight.log import FlightLog, Stream
+from haltere.flight.schema import column as schema_column
 
 __all__ = ["Checked", "check", "first_fix"]
 
 #: IMU rates [Hz] below which a strapdown filter is worth nothing, and below which it is worth little.
 RATE_MIN, RATE_POOR = 10.0, 50.0
+#: No small gyro or accelerometer measures more [rad/s, m/s^2].
+RATE_MAX, FORCE_MAX = 100.0, 500.0
 Mask = NDArray[np.bool_]
 
 
@@ -57,6 +60,7 @@ def check(flight: FlightLog, *, upright: bool = True) -> Checked:
         No IMU that could be navigated with: absent, columns missing, too few samples, too slow, or in the wrong unit or sign.
     """
     out = Checked({}, {k: dict(v) for k, v in flight.discarded.items()}, list(flight.notes))
+    _check_types(flight)
     _check_imu(flight, out, upright)
     for name, rule in (("magnetometer", _check_magnetometer), ("gnss", _check_gnss), ("barometer", _check_barometer)):
         stream = flight.get(name)
@@ -65,6 +69,16 @@ def check(flight: FlightLog, *, upright: bool = True) -> Checked:
             if len(stream):
                 out.streams[name] = stream
     return out
+
+
+def _check_types(flight: FlightLog) -> None:
+    """Refuse text where the schema has numbers."""
+    for name in ("imu", "magnetometer", "gnss", "barometer"):
+        stream = flight.get(name)
+        for column in stream.names if stream is not None and len(stream) else ():
+            values = stream[column] if stream is not None else None
+            if values is not None and values.dtype.kind != "f" and schema_column(name, column) is not None:
+                raise HaltereError("numbers", f"text such as {str(values[0])!r}", f"stream {name}, column {column}", "check the column map")
 
 
 def _clean_time(out: Checked, name: str, stream: Stream) -> Stream:
@@ -113,15 +127,22 @@ def _check_imu(flight: FlightLog, out: Checked, upright: bool) -> None:
         )
     if not 3.0 < f_mid < 40.0:
         raise HaltereError("specific force near 9.81 m/s^2", f"median {f_mid:.3g}", where, "check unit and columns of the accelerometer")
-    if w_mid > 15.0:
-        raise HaltereError("angular rates in rad/s", f"median {w_mid:.1f}", where, "it looks like deg/s: give the unit in the column map")
+    w_high = float(np.quantile(w, 0.95))
+    if w_mid > 15.0 or w_high > 25.0:
+        raise HaltereError(
+            "angular rates in rad/s",
+            f"median {w_mid:.1f}, one in twenty above {w_high:.0f}",
+            where,
+            "it looks like deg/s: give the unit in the column map",
+        )
     up = float(np.mean(imu["accel_z"] > 0.5 * f_mid))
     if upright and up > 0.9:
         raise HaltereError(
             "specific force with z near -9.81 m/s^2 when level (FRD)", f"positive z in {100 * up:.0f} % of the samples", where,
             "the axes look FLU, or gravity is given instead of specific force: set frame or mounting",
         )  # fmt: skip
-    out.streams["imu"] = imu
+    impossible = (np.abs(imu.vector("gyro")).max(axis=1) > RATE_MAX) | (np.abs(imu.vector("accel")).max(axis=1) > FORCE_MAX)
+    out.streams["imu"] = out.drop("imu", imu, ~impossible, "impossible value")
 
 
 def _check_magnetometer(out: Checked, stream: Stream) -> Stream:
