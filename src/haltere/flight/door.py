@@ -127,14 +127,11 @@ def _check_imu(flight: FlightLog, out: Checked, upright: bool) -> None:
         )
     if not 3.0 < f_mid < 40.0:
         raise HaltereError("specific force near 9.81 m/s^2", f"median {f_mid:.3g}", where, "check unit and columns of the accelerometer")
-    w_high = float(np.quantile(w, 0.95))
-    if w_mid > 15.0 or w_high > 25.0:
-        raise HaltereError(
-            "angular rates in rad/s",
-            f"median {w_mid:.1f}, one in twenty above {w_high:.0f}",
-            where,
-            "it looks like deg/s: give the unit in the column map",
-        )
+    # half of a flight tumbling at most of a turn a second is no flight; a fast turn about z is (a vehicle that lost a rotor spins)
+    tumble = float(np.median(np.hypot(imu["gyro_x"], imu["gyro_y"])))
+    if tumble > 5.0 or w_mid > RATE_MAX:
+        found = f"a median of {tumble:.1f} about the horizontal axes"
+        raise HaltereError("angular rates in rad/s", found, where, "it looks like deg/s: give the unit in the column map")
     up = float(np.mean(imu["accel_z"] > 0.5 * f_mid))
     if upright and up > 0.9:
         raise HaltereError(
