@@ -59,10 +59,11 @@ if COMPILED:
     _FOLDER = str(cache_folder())
 
     def _compile(function: F, **options: bool) -> F:
+        # no reference counts (_nrt): a kernel only borrows arrays, so that none need be counted at every call, and none can be made
         before = numba.config.CACHE_DIR  # type: ignore[attr-defined]
         numba.config.CACHE_DIR = _FOLDER  # type: ignore[attr-defined]
         try:
-            compiled: object = numba.njit(cache=True, error_model="numpy", **options)(function)  # type: ignore[call-overload]
+            compiled: object = numba.njit(cache=True, error_model="numpy", _nrt=False, **options)(function)  # type: ignore[call-overload]
             return cast(F, compiled)
         finally:
             numba.config.CACHE_DIR = before  # type: ignore[attr-defined]

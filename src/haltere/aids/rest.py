@@ -7,7 +7,7 @@ from typing import Any
 
 from haltere._jit import jit
 from haltere.aids.record import GNSS_VELOCITY
-from haltere.core.rotation import Vec
+from haltere.core.rotation import Vec, norm
 
 __all__ = ["at_rest", "forget", "monitor", "quiet"]
 
@@ -45,12 +45,12 @@ def judge(s: Any, prm: Any) -> None:
             ww += m.ww[b, i]
             f += m.f[b, i]
         m.mean_w[i], m.mean_f[i] = w / n, f / n
-        spread = max(spread, ww / n - (w / n) ** 2)
-    mean_f = math.sqrt(m.mean_f[0] ** 2 + m.mean_f[1] ** 2 + m.mean_f[2] ** 2)
+        spread = max(spread, ww / n - (w / n) * (w / n))
+    mean_f = norm((m.mean_f[0], m.mean_f[1], m.mean_f[2]))
     m.mean_a = a / n
-    sd_a = math.sqrt(max(0.0, aa / n - (a / n) ** 2))
-    rate = math.sqrt(m.mean_w[0] ** 2 + m.mean_w[1] ** 2 + m.mean_w[2] ** 2)
-    still = spread < prm.rest_gyro**2 and sd_a < prm.rest_accel and abs(mean_f - s.gravity) < prm.rest_gravity
+    sd_a = math.sqrt(max(0.0, aa / n - (a / n) * (a / n)))
+    rate = norm((m.mean_w[0], m.mean_w[1], m.mean_w[2]))
+    still = spread < prm.rest_gyro * prm.rest_gyro and sd_a < prm.rest_accel and abs(mean_f - s.gravity) < prm.rest_gravity
     m.still = 1 if still and rate < 5.0 * prm.rest_gyro else 0
 
 
@@ -101,14 +101,14 @@ def at_rest(s: Any, prm: Any, w: Vec, f: Vec) -> bool:
     cruise looks alike to an IMU.
     """
     m = s.rest
-    speed2 = s.v[0] ** 2 + s.v[1] ** 2 + s.v[2] ** 2
+    speed2 = s.v[0] * s.v[0] + s.v[1] * s.v[1] + s.v[2] * s.v[2]
     sd2 = s.P[3, 3] + s.P[4, 4] + s.P[5, 5]
     gnss_speaks = s.aid[GNSS_VELOCITY].started > 0 and s.t - s.aid[GNSS_VELOCITY].t_passed < 1.0
     if speed2 > 1.5**2 and sd2 < 0.75**2:
         m.moved = 1
     if gnss_speaks and speed2 < 0.3**2:
         m.moved = 0
-    fix2 = s.yaw.z[0] ** 2 + s.yaw.z[1] ** 2  # the last GNSS velocity
-    denied = s.t - s.aid[GNSS_VELOCITY].t_offered < 1.0 and fix2 > (0.5 + 2.0 * math.sqrt(s.yaw.r)) ** 2
+    fix = math.sqrt(s.yaw.z[0] * s.yaw.z[0] + s.yaw.z[1] * s.yaw.z[1])  # the last GNSS velocity
+    denied = s.t - s.aid[GNSS_VELOCITY].t_offered < 1.0 and fix > 0.5 + 2.0 * math.sqrt(s.yaw.r)
     small = speed2 < 0.5**2 + 4.0 * sd2 and not denied
     return m.still == 1 and small and (gnss_speaks or m.moved == 0) and quiet(s, prm, w, f)

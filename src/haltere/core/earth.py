@@ -19,14 +19,16 @@ DEG = math.pi / 180.0
 @entry
 def gravity(lat: float, alt: float) -> float:
     """Normal gravity [m/s^2] at latitude [deg] and altitude [m] (Somigliana with free-air term, theory-amendments.md §8)."""
-    s2 = math.sin(lat * DEG) ** 2
+    s = math.sin(lat * DEG)
+    s2 = s * s
     return 9.7803253359 * (1.0 + 0.00193185265241 * s2) / math.sqrt(1.0 - 0.00669437999013 * s2) - 3.086e-6 * alt
 
 
 @jit
 def radii(lat: float) -> tuple[float, float]:
     """Meridian and transverse radius of curvature [m] at latitude [deg]."""
-    w2 = 1.0 - E2_WGS84 * math.sin(lat * DEG) ** 2
+    s = math.sin(lat * DEG)
+    w2 = 1.0 - E2_WGS84 * (s * s)
     w = math.sqrt(w2)
     return A_WGS84 * (1.0 - E2_WGS84) / (w2 * w), A_WGS84 / w
 

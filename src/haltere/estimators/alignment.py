@@ -201,8 +201,10 @@ def start(s: Any, prm: Any, kind: int, f_b: Vec, a_n: Vec) -> None:
     if not known:  # without a compass the turn about the specific force is unknown; at rest that is the vertical
         d = scale(f_b, 1.0 / norm(f_b))
     tilt = prm.init_tilt_rest if kind == AT_REST else prm.init_tilt_motion
-    tilt2 = tilt * tilt + (prm.init_accel_bias / s.gravity) ** 2
-    yaw2 = (prm.init_yaw_compass if passed else (YAW_TWO_SPANS if known else prm.init_yaw_unknown)) ** 2
+    from_bias = prm.init_accel_bias / s.gravity
+    tilt2 = tilt * tilt + from_bias * from_bias
+    yaw = prm.init_yaw_compass if passed else (YAW_TWO_SPANS if known else prm.init_yaw_unknown)
+    yaw2 = yaw * yaw
     for i in range(3):
         for j in range(3):
             P[i, j] = (yaw2 - tilt2) * d[i] * d[j]
@@ -267,7 +269,7 @@ def gather(s: Any, prm: Any, rotation: Vec, dv: Vec, dt: float) -> None:
         a.f[i] += df[i]
     fresh = take_due(s, prm)
 
-    gnss_speed = math.sqrt(a.gnss_v[0] ** 2 + a.gnss_v[1] ** 2 + a.gnss_v[2] ** 2)
+    gnss_speed = norm((a.gnss_v[0], a.gnss_v[1], a.gnss_v[2]))
     gnss_recent = s.t - a.t_gnss_v < 2.0
     judged = s.rest.filled >= 4
     waited = s.t - a.t_first

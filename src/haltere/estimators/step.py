@@ -227,6 +227,36 @@ def advance(s: Any, prm: Any, rows: Any, cov: Any, aids: Any) -> None:
     write_covariance(s, prm, cov)
 
 
+@jit
+def take(s: Any, t: float, gyro: Vec, accel: Vec) -> int:
+    """Queue an IMU sample, or refuse and count it; see `step` for what comes back."""
+    if not (math.isfinite(t) and math.isfinite(gyro[0] + gyro[1] + gyro[2] + accel[0] + accel[1] + accel[2])):
+        s.n_bad += 1
+        return 1
+    if s.n_steps + s.imu_n > 0 and t <= s.t_newest:
+        s.n_bad += 1
+        return 2
+    if max(abs(gyro[0]), abs(gyro[1]), abs(gyro[2])) > RATE_MAX or max(abs(accel[0]), abs(accel[1]), abs(accel[2])) > FORCE_MAX:
+        s.n_bad += 1
+        return 3
+    push_imu(s, t, gyro, accel)
+    s.t_newest = t
+    return 0
+
+
+@jit
+def behind(s: Any, prm: Any) -> bool:
+    """Whether the horizon is to move: the oldest queued IMU sample is old enough, or there is no room for the next one (counted)."""
+    if s.imu_n == 0:
+        return False
+    if s.imu[s.imu_head].t <= s.t_newest - prm.horizon:
+        return True
+    if s.imu_n < len(s.imu):
+        return False
+    s.n_ring_full += 1  # the horizon comes closer than configured
+    return True
+
+
 @entry
 def step(S: Any, PRM: Any, t: float, gyro: Vec, accel: Vec, rows: Any, cov: Any, aids: Any) -> int:
     """Take one IMU sample, and move the horizon as far as ``horizon`` behind it.
@@ -248,23 +278,10 @@ def step(S: Any, PRM: Any, t: float, gyro: Vec, accel: Vec, rows: Any, cov: Any,
         0 taken; 1 not finite; 2 not after the sample before; 3 beyond any sensor. All but 0 are counted and left out.
     """
     s, prm = S[0], PRM[0]
-    if not (math.isfinite(t) and math.isfinite(gyro[0] + gyro[1] + gyro[2] + accel[0] + accel[1] + accel[2])):
-        s.n_bad += 1
-        return 1
-    if s.n_steps + s.imu_n > 0 and t <= s.t_newest:
-        s.n_bad += 1
-        return 2
-    if max(abs(gyro[0]), abs(gyro[1]), abs(gyro[2])) > RATE_MAX or max(abs(accel[0]), abs(accel[1]), abs(accel[2])) > FORCE_MAX:
-        s.n_bad += 1
-        return 3
-    if s.imu_n == len(s.imu):  # no room: the horizon comes closer than configured
-        s.n_ring_full += 1
+    status = take(s, t, gyro, accel)
+    while behind(s, prm):
         advance(s, prm, rows, cov, aids)
-    push_imu(s, t, gyro, accel)
-    s.t_newest = t
-    while s.imu_n > 0 and s.imu[s.imu_head].t <= t - prm.horizon:
-        advance(s, prm, rows, cov, aids)
-    return 0
+    return status
 
 
 @entry
@@ -311,7 +328,7 @@ def run_chunk(
     cov: Any,
     aids: Any,
 ) -> tuple[int, int]:
-    """Drive `offer` and `step` over IMU samples i ... i_end - 1 and the measurements stamped at or before them.
+    """Do what `offer` and `step` do, over IMU samples i ... i_end - 1 and the measurements stamped at or before them.
 
     After the last sample of all, the horizon moves up to it, as `flush` does. Stops early when the output arrays are nearly
     full, so that nothing is lost. The same calls in the same order online give the same numbers.
@@ -331,17 +348,17 @@ def run_chunk(
         Next IMU sample and next measurement.
     """
     s, prm = S[0], PRM[0]
-    while i < i_end or (i == len(t) and s.imu_n > 0):
-        if s.n_aids > len(aids) - 2048 or s.n_events > len(s.event) - 8 or s.n_rows > rows.shape[0] - 2 * len(s.imu):
-            break
-        if i == len(t):
+    while s.n_aids <= len(aids) - 2048 and s.n_events <= len(s.event) - 8 and s.n_rows <= rows.shape[0] - 2 * len(s.imu):
+        if behind(s, prm) or (i == len(t) and s.imu_n > 0):  # the one call of `advance` here: with a second one it is compiled twice
             advance(s, prm, rows, cov, aids)
-            continue
-        while j < len(stamps) and stamps[j] <= t[i]:
-            offer(S, PRM, kinds[j], stamps[j], (z[j, 0], z[j, 1], z[j, 2]), (r[j, 0], r[j, 1], r[j, 2]))
-            j += 1
-        step(S, PRM, t[i], (gyro[i, 0], gyro[i, 1], gyro[i, 2]), (accel[i, 0], accel[i, 1], accel[i, 2]), rows, cov, aids)
-        i += 1
+        elif i < i_end:
+            while j < len(stamps) and stamps[j] <= t[i]:
+                offer(S, PRM, kinds[j], stamps[j], (z[j, 0], z[j, 1], z[j, 2]), (r[j, 0], r[j, 1], r[j, 2]))
+                j += 1
+            take(s, t[i], (gyro[i, 0], gyro[i, 1], gyro[i, 2]), (accel[i, 0], accel[i, 1], accel[i, 2]))
+            i += 1
+        else:
+            break
     return i, j
 
 

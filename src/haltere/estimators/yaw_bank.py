@@ -28,6 +28,9 @@ TILT_SPOILT, VEL_SPOILT, POS_SPOILT, BG_SPOILT, BA_SPOILT = math.radians(5.0), 2
 #: Yaw is unknown above this 1 sigma, and contradicted from this error on, once GNSS velocity is refused for this long [s].
 SD_UNKNOWN, ERROR_MIN, REFUSED = math.radians(20.0), math.radians(25.0), 1.0
 
+#: Half the angle between two hypotheses at the start [rad].
+SPACING = math.pi / HYPOTHESES
+
 
 @jit
 def forget(s: Any) -> None:
@@ -42,7 +45,7 @@ def forget(s: Any) -> None:
             for k in range(3):
                 b.P[i, j, k] = 0.0
         b.x[i, 2] = wrap(2.0 * math.pi * i / HYPOTHESES)
-        b.P[i, 2, 2] = (math.pi / HYPOTHESES) ** 2
+        b.P[i, 2, 2] = SPACING * SPACING
 
 
 @jit
