@@ -164,10 +164,10 @@ def test_symmetrise() -> None:
     rng = np.random.default_rng(5)
     s = state(rng, 1)
     s["P"][:] += rng.standard_normal((16, 16))
-    expected = 0.5 * (s["P"] + s["P"].T)
+    upper = np.triu(s["P"])
     symmetrise(s)
     assert (s["P"] == s["P"].T).all()
-    np.testing.assert_allclose(s["P"], expected, rtol=1e-15, atol=1e-300)
+    assert (np.triu(s["P"]) == upper).all()
 
 
 def test_covariance_stays_symmetric_and_positive_over_a_hundred_thousand_steps() -> None:

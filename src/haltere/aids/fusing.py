@@ -21,7 +21,7 @@ from haltere.aids.record import (
 )
 from haltere.core.rotation import Vec, dcm
 from haltere.filter.gates import ABSENT, inflation, joint_nis, optimal_gain
-from haltere.filter.update import NONE, Row, apply, innovation, project, symmetrise, variance
+from haltere.filter.update import NONE, Row, apply, innovation, project, variance
 from haltere.strapdown.propagate import inject
 
 __all__ = ["DISTRUSTED", "NOTHING", "NO_GATE", "NO_TIMEOUT", "Offer", "fuse_offer", "judge", "unit_rows"]
@@ -133,7 +133,6 @@ def fuse_offer(s: Any, aids: Any, t: float, sensor: int, offer: Offer) -> None:
                     project_gain(s)
                 apply(s, row, r_i, innovation(s, row, e_i))
         inject(s)
-        symmetrise(s)
     for i in range(n):
         if z[i] == z[i]:
             record(s, aids, t, sensor, component + i, z[i], e[i], math.sqrt(s_ii[i]), ratio, weight, status, reason)

@@ -105,14 +105,11 @@ def apply(s: Any, H: Row, r: float, e: float) -> None:
 
 @jit
 def symmetrise(s: Any) -> None:
-    """Make P exactly symmetric again; the update keeps it so to rounding."""
+    """Make P exactly symmetric again, from its upper triangle; the update keeps it so to rounding."""
     P = s.P
-    n = s.P.shape[0]
-    for i in range(n):
+    for i in range(s.P.shape[0]):
         for j in range(i):
-            m = 0.5 * (P[i, j] + P[j, i])
-            P[i, j] = m
-            P[j, i] = m
+            P[i, j] = P[j, i]
 
 
 @jit

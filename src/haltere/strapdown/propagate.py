@@ -9,6 +9,7 @@ from typing import Any
 
 from haltere._jit import jit
 from haltere.core.rotation import Mat, Vec, cross, dcm, dot, mat_vec, quat_from_rotvec, quat_mul, quat_unit, rotvec_dcm
+from haltere.filter.update import symmetrise
 
 __all__ = ["inject", "left_F", "mechanise", "predict", "turn"]
 
@@ -156,7 +157,7 @@ def predict(s: Any, prm: Any, w: Vec, f: Vec, rotation: Vec, dv_mid: Vec, dt: fl
 
 @jit
 def inject(s: Any) -> None:
-    """Move the correction ``s.dx`` into the nominal state, reset it, and turn P with it: G_θθ = I - ½[δθ]×."""
+    """Move the correction ``s.dx`` into the nominal state, reset it, and turn P with it, G_θθ = I - ½[δθ]×; P is symmetric after it."""
     dx, P = s.dx, s.P
     n = s.P.shape[0]
     t = (dx[0], dx[1], dx[2])
@@ -176,10 +177,11 @@ def inject(s: Any) -> None:
         P[0, j] -= 0.5 * c[0]
         P[1, j] -= 0.5 * c[1]
         P[2, j] -= 0.5 * c[2]
-    for j in range(n):
-        c = cross(t, (P[j, 0], P[j, 1], P[j, 2]))
-        P[j, 0] -= 0.5 * c[0]
-        P[j, 1] -= 0.5 * c[1]
-        P[j, 2] -= 0.5 * c[2]
+    for i in range(3):  # the last columns are turned by symmetry
+        c = cross(t, (P[i, 0], P[i, 1], P[i, 2]))
+        P[i, 0] -= 0.5 * c[0]
+        P[i, 1] -= 0.5 * c[1]
+        P[i, 2] -= 0.5 * c[2]
     for i in range(n):
         dx[i] = 0.0
+    symmetrise(s)
