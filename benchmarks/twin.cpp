@@ -50,9 +50,10 @@ inline Quat unit(Quat q) {
 inline Quat exponential(Vec r) {
     const double angle2 = dot(r, r);
     double c, s;
-    if (angle2 < 1e-8) {
-        c = 1.0 - angle2 / 8.0;
-        s = 0.5 - angle2 / 48.0;
+    if (angle2 < 0.01) {  // Taylor, exact to rounding
+        const double h2 = 0.25 * angle2;
+        c = 1.0 - h2 / 2.0 * (1.0 - h2 * (1.0 / 12.0) * (1.0 - h2 * (1.0 / 30.0) * (1.0 - h2 * (1.0 / 56.0))));
+        s = 0.5 - h2 * (1.0 / 12.0) * (1.0 - h2 * (1.0 / 20.0) * (1.0 - h2 * (1.0 / 42.0) * (1.0 - h2 * (1.0 / 72.0))));
     } else {
         const double angle = std::sqrt(angle2);
         c = std::cos(0.5 * angle);
@@ -150,9 +151,10 @@ struct Filter {
         for (int k = 0; k < 4; ++k) s.t_passed[k] = t_passed[k], s.n_fused[k] = n_fused[k], s.n_rejected[k] = n_rejected[k];
     }
 
-    // P <- F P: rows 0-8 change, the rest of F is one.
+    // P <- F P in the first columns: rows 0-8 change, the rest of F is one.
+    template <int COLUMNS>
     void left(const Mat& D, const Mat& A, const Mat& B, double dt) {
-        for (int j = 0; j < N; ++j) {
+        for (int j = 0; j < COLUMNS; ++j) {
             const double t0 = P[0][j], t1 = P[1][j], t2 = P[2][j], b0 = P[12][j], b1 = P[13][j], b2 = P[14][j];
             double d[3];
             for (int i = 0; i < 3; ++i)
@@ -165,9 +167,15 @@ struct Filter {
         }
     }
 
-    void transpose() {
-        for (int i = 0; i < N; ++i)
+    // P <- F P F'. The columns of F' from 9 on are those of one: F P is final there, the rows below follow by symmetry, and only
+    // the first nine columns of (F P)' are multiplied again.
+    void congruence(const Mat& D, const Mat& A, const Mat& B, double dt) {
+        left<N>(D, A, B, dt);
+        for (int i = 0; i < BG; ++i)
             for (int j = 0; j < i; ++j) std::swap(P[i][j], P[j][i]);
+        for (int i = BG; i < N; ++i)
+            for (int j = 0; j < BG; ++j) P[i][j] = P[j][i];
+        left<BG>(D, A, B, dt);
     }
 
     void predict(Vec w0, Vec f0, Vec w1, Vec f1, double dt) {
@@ -202,9 +210,7 @@ struct Filter {
             A.m[i][2] = C.m[i][1] * f.x - C.m[i][0] * f.y;
             for (int j = 0; j < 3; ++j) B.m[i][j] = -dt * C.m[i][j];
         }
-        left(D, A, B, dt);
-        transpose();
-        left(D, A, B, dt);
+        congruence(D, A, B, dt);
 
         const double qg = prm.noise_gyro * prm.noise_gyro, qa = prm.noise_accel * prm.noise_accel;
         const double qbg = prm.noise_gyro_bias * prm.noise_gyro_bias, qba = prm.noise_accel_bias * prm.noise_accel_bias;

@@ -90,6 +90,11 @@ def _pose(log: Log, builder: Builder, stream: str, suffix: str) -> list[tuple[In
         for name, flag in (("lat", "lat_lon_valid"), ("lon", "lat_lon_valid"), ("alt", "alt_valid")):
             if flag in position:
                 columns[name][position.data[flag] == 0] = np.nan
+        home = builder.meta.home
+        known = np.isfinite(columns["alt"])
+        if home is not None and known.any() and abs(float(np.median(columns["alt"][known])) - home.alt) > ALTITUDE_DATUM_LIMIT:
+            builder.note(f"{stream} alt does not count from mean sea level: NaN in {int(known.sum())} samples")
+            columns["alt"] = np.full(len(position), np.nan)
         pieces.append((position.us, columns))
     return pieces
 
