@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
@@ -13,10 +13,9 @@ from haltere.flight.local import local_from_geodetic
 from haltere.flight.log import FlightLog, Stream
 from haltere.flight.solution import Solution
 from haltere.metrics.attitude import euler
-from haltere.report.panels import Figure
 from haltere.report.series import Pool, breaks
 
-__all__ = ["COMPONENTS", "SENSORS", "Context", "Episode", "Section", "covered", "sensor_label"]
+__all__ = ["COMPONENTS", "SENSORS", "Context", "Episode", "covered", "sensor_label"]
 
 FloatArray = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -46,17 +45,6 @@ COMPONENTS: dict[str, tuple[str, str, float, float]] = {
 def sensor_label(sensor: str) -> str:
     """What a reader calls a sensor."""
     return SENSORS.get(sensor, sensor.replace("_", " "))
-
-
-@dataclass
-class Section:
-    """One part of the page: its figures, and HTML before and after them."""
-
-    key: str
-    title: str
-    note: str = ""
-    figures: list[Figure] = field(default_factory=list)
-    after: str = ""
 
 
 @dataclass(frozen=True)

@@ -8,7 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from haltere.metrics.errors import reference_position
-from haltere.report.context import Context, Section, covered, sensor_label
+from haltere.report.context import Context, covered, sensor_label
+from haltere.report.markup import Section
 from haltere.report.panels import FOOT, LEFT, TOP, pen, plain
 from haltere.report.series import display, thin
 from haltere.report.style import AXES, SENSOR_COLOURS

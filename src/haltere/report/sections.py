@@ -10,7 +10,8 @@ from numpy.typing import NDArray
 from haltere.flight.config import KEYS
 from haltere.metrics.attitude import euler
 from haltere.metrics.errors import error_series, reference_position
-from haltere.report.context import COMPONENTS, Context, Section, sensor_label
+from haltere.report.context import COMPONENTS, Context, sensor_label
+from haltere.report.markup import Section
 from haltere.report.panels import Panels
 from haltere.report.style import SENSOR_COLOURS
 

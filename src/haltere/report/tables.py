@@ -2,40 +2,19 @@
 
 from __future__ import annotations
 
-import html
 import math
-from collections.abc import Iterable, Sequence
 from typing import Any
 
 from haltere.flight.config import KEYS, Value, defaults
 from haltere.flight.schema import base_name
-from haltere.report.context import Context, Section, sensor_label
+from haltere.report.context import Context, sensor_label
+from haltere.report.markup import Section, escape, table
 from haltere.report.words import count, discarded, episode_in_words, nis_in_words, number
 
-__all__ = ["configuration", "consistency", "data", "errors_table", "escape", "events", "table"]
+__all__ = ["configuration", "consistency", "data", "errors_table", "events"]
 
 #: Rows of a table of events or episodes at most.
 ROWS = 40
-
-
-def escape(text: object) -> str:
-    """Text for HTML."""
-    return html.escape(str(text), quote=True)
-
-
-def table(heads: Sequence[str], rows: Iterable[Sequence[str]], classes: Sequence[str] = (), caption: str = "") -> str:
-    """A table of cells that are HTML already; columns after the first whose head ends in a blank are text, others numbers."""
-    kinds = ["" if k == 0 or h.endswith(" ") else ' class="num"' for k, h in enumerate(heads)]
-    head = "".join(f"<th{kind}>{escape(h.strip())}</th>" for h, kind in zip(heads, kinds, strict=True))
-    marks = [*classes]
-    body = "".join(
-        f"<tr{f' class={chr(34)}{marks[i]}{chr(34)}' if i < len(marks) and marks[i] else ''}>"
-        + "".join(f"<td{kind}>{cell}</td>" for cell, kind in zip(row, kinds, strict=True))
-        + "</tr>"
-        for i, row in enumerate(rows)
-    )
-    title = f"<caption>{escape(caption)}</caption>" if caption else ""
-    return f'<div class="wide"><table>{title}<thead><tr>{head}</tr></thead><tbody>{body}</tbody></table></div>'
 
 
 _UNITS = {"gyro_bias": ("deg/s", 180.0 / math.pi), "accel_bias": ("m/s²", 1.0), "vel": ("m/s", 1.0), "pos": ("m", 1.0)}
