@@ -14,18 +14,20 @@ from haltere.errors import HaltereError
 from haltere.flight.folder import read_folder
 from haltere.flight.log import FlightLog, FlightMeta
 from haltere.readers import read
-from haltere.readers.support import streams, support
+from haltere.readers._settings import SETTINGS, settings_of
+from haltere.readers.support import ESTIMATORS, doubts, streams, support
 
 
 def _flight(rate: float = 100.0, source: str = "PX4 ULog: x", without: tuple[str, ...] = ()) -> FlightLog:
     t = np.arange(0.0, 10.0, 1.0 / rate)
     slow = np.arange(0.0, 10.0, 0.2)
     one, z = np.ones_like(slow), np.zeros_like(t)
+    fix = {"lat": 47.4 * one, "lon": 8.5 * one, "alt": 500.0 * one, "vel_n": 0 * one, "vel_e": 0 * one, "vel_d": 0 * one}
     flight = FlightLog(
         {
             "imu": {"t": t, "gyro_x": z, "gyro_y": z, "gyro_z": z, "accel_x": z, "accel_y": z, "accel_z": z - 9.81},
             "magnetometer": {"t": slow, "mag_x": 20 * one, "mag_y": 0 * one, "mag_z": 40 * one},
-            "gnss": {"t": slow, "lat": one, "lon": one, "alt": one, "vel_n": one, "vel_e": one, "vel_d": one, "fix_type": 3 * one},
+            "gnss": {"t": slow, **fix, "fix_type": 3 * one},
             "barometer": {"t": slow, "pressure": 1e5 * one},
         },
         FlightMeta(name="made", source=source),
@@ -57,6 +59,76 @@ def test_what_is_missing_is_named_with_its_cure(without: tuple[str, ...], naviga
         assert (found["navigator"][0], found["ahrs"][0]) == (navigator, ahrs)
         assert said in found["navigator"][1]
         assert cure in found["navigator"][2]
+
+
+def test_every_estimator_is_judged_and_every_origin_has_every_setting() -> None:
+    from haltere.estimators.registry import SPECIFICATIONS
+
+    # One line each; an estimator without one would be silently left out of `haltere info`.
+    assert {"navigator", "ahrs"} <= set(ESTIMATORS) <= set(SPECIFICATIONS)
+    keys = set(settings_of(""))
+    for origin, settings in SETTINGS.items():
+        assert set(settings) == keys, origin
+        assert settings_of(f"{origin}: log") is settings
+
+
+@pytest.mark.parametrize(
+    ("source", "without", "words"),
+    [
+        ("PX4 ULog: x", (), "esc_status 5"),
+        ("PX4 ULog: x", (), "SDLOG_PROFILE has bit 4"),
+        ("ArduPilot DataFlash: x", (), "SERVO_BLH_BDMASK"),
+        ("ArduPilot DataFlash: x", ("magnetometer",), "13 on Copter"),
+        ("Blackbox: x", (), "dshot_bidir = ON"),
+        ("Blackbox: x", ("imu",), "blackbox_sample_rate"),
+        ("Blackbox: x", ("magnetometer",), "record the compass elsewhere"),
+        ("ROS bag: x", ("magnetometer", "barometer"), "add /fmu/out/vehicle_air_data"),
+        ("DJI DatCon CSV: x", ("magnetometer",), "counts"),
+    ],
+)
+def test_the_setting_that_helps_is_named(source: str, without: tuple[str, ...], words: str) -> None:
+    assert words in _by_name(_flight(source=source, without=without))["navigator"][2]
+
+
+def test_missing_velocity_has_its_own_cure() -> None:
+    for column, said in (("vel_n", "only positions"), ("vel_d", "vertical velocity")):
+        flight = _flight()
+        flight["gnss"].columns[column][:] = np.nan
+        _, cannot, remedies = _by_name(flight)["navigator"]
+        assert said in cannot
+        assert "vel_ned_valid" in remedies
+
+
+def test_suspicious_units_are_told() -> None:
+    flight = _flight(source="table: x")
+    flight["magnetometer"].columns["mag_x"] *= 1e-2
+    flight["magnetometer"].columns["mag_z"] *= 1e-2
+    assert doubts(_flight()) == []
+    (doubt,) = [d for d in doubts(flight) if "gauss" in d]
+    assert "magnetometer" in doubt
+    assert summary(flight)["doubts"] == doubts(flight)
+
+
+def test_the_rate_of_a_solution_is_that_of_its_attitude() -> None:
+    """Rows of several topics lie between each other: attitude at 10 Hz and position half way between, once a second."""
+    from haltere.metrics.summary import _attitudes
+
+    fast, slow = np.arange(0.0, 10.0, 0.1), np.arange(0.05, 10.0, 1.0)
+    t = np.sort(np.r_[fast, slow])
+    q = np.where(np.isin(t, fast), 1.0, np.nan)
+    stream = FlightLog({"onboard": {"t": t, "q_w": q, "pos_n": np.where(np.isin(t, slow), 5.0, np.nan)}})["onboard"]
+    assert _attitudes(stream).rate == pytest.approx(10.0)
+    (numbers,) = streams(FlightLog({"onboard": stream}))
+    assert numbers.rate == pytest.approx(10.0)
+    assert numbers.gaps == 0
+
+
+def test_modes_have_no_rate() -> None:
+    flight = FlightLog({"modes": {"t": [0.0, 1.0, 100.0], "mode": ["a", "b", "c"]}})
+    (modes,) = streams(flight)
+    assert np.isnan(modes.rate)
+    assert modes.gaps == 0
+    assert summary(flight)["streams"]["modes"]["rate"] is None
 
 
 def test_slow_imu_is_limited_and_too_slow_is_refused() -> None:

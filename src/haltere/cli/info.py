@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 __all__ = ["info", "summary"]
 
 
-def info(log: Path, json: bool = False) -> None:
+def info(log: Path, json: bool = False, columns: Path | None = None, column: list[str] | None = None) -> None:
     """Print what a log holds.
 
     Parameters
@@ -24,15 +24,18 @@ def info(log: Path, json: bool = False) -> None:
         A log or flight folder.
     json
         Print only the summary, as JSON.
+    columns, column
+        Column map of a single table: a file, and single columns.
 
     Raises
     ------
     HaltereError
         The log cannot be read.
     """
+    from haltere.cli.columns import column_map
     from haltere.readers import read
 
-    flight = read(log)
+    flight = read(log, column_map(columns, column))
     if json:
         print(json_.dumps(summary(flight), indent=2, allow_nan=False, ensure_ascii=False))
         return
@@ -47,10 +50,11 @@ def summary(flight: FlightLog) -> dict[str, Any]:
     Returns
     -------
     dict
-        ``haltere, name, source, start_utc, time_offset, home, streams, notes, discarded, estimators``. Numbers that are not known are None.
+        ``haltere, name, source, start_utc, time_offset, home, streams, notes, doubts, discarded, estimators``. Numbers that are not
+        known are None; ``doubts`` are units and axes that look wrong, with the key that puts them right.
     """
     from haltere._version import __version__
-    from haltere.readers.support import streams, support
+    from haltere.readers.support import doubts, streams, support
 
     meta = flight.meta
     return {
@@ -78,6 +82,7 @@ def summary(flight: FlightLog) -> dict[str, Any]:
             for s in streams(flight)
         },
         "notes": flight.notes,
+        "doubts": doubts(flight),
         "discarded": flight.discarded,
         "estimators": {
             s.estimator: {"verdict": s.verdict, "can": list(s.can), "cannot": list(s.cannot), "remedies": list(s.remedies)}
@@ -88,6 +93,10 @@ def summary(flight: FlightLog) -> dict[str, Any]:
 
 def _known(value: float) -> float | None:
     return value if math.isfinite(value) else None
+
+
+def _cell(value: float, digits: int) -> str:
+    return f"{value:.{digits}f}" if math.isfinite(value) else "-"
 
 
 def _columns(columns: dict[str, str]) -> str:
@@ -107,14 +116,15 @@ def _print(flight: FlightLog, console: Console) -> None:
     from rich.markup import escape
     from rich.table import Table
 
-    from haltere.readers.support import streams, support
+    from haltere.readers.support import doubts, streams, support
 
     meta = flight.meta
     console.print(f"[bold]{escape(meta.name)}[/bold]  {escape(meta.source)}")
+    clock = f"t {'-' if meta.time_offset < 0.0 else '+'} {abs(meta.time_offset):.6f} s"
     if meta.start_utc:
-        console.print(f"start {meta.start_utc}, log clock = t + {meta.time_offset:.6f} s")
+        console.print(f"start {meta.start_utc}, log clock = {clock}")
     elif meta.time_offset:
-        console.print(f"log clock = t + {meta.time_offset:.6f} s, UTC unknown")
+        console.print(f"log clock = {clock}, UTC unknown")
     if meta.home:
         console.print(f"home {meta.home.lat:.7f} deg, {meta.home.lon:.7f} deg, {meta.home.alt:.1f} m")
     table = Table(box=None, pad_edge=False, header_style="bold")
@@ -123,14 +133,16 @@ def _print(flight: FlightLog, console: Console) -> None:
         table.add_column(head, justify="right", no_wrap=True)
     alike: dict[str, list[str]] = {}
     for s in streams(flight):
-        numbers = (f"{s.n}", f"{s.rate:.1f}", f"{s.mean_rate:.1f}", f"{s.start:.2f}", f"{s.end:.2f}", f"{s.gaps}", f"{s.largest_gap:.3f}")
-        table.add_row(s.name, *numbers)
+        numbers = (_cell(s.rate, 1), _cell(s.mean_rate, 1), _cell(s.start, 2), _cell(s.end, 2))
+        table.add_row(s.name, f"{s.n}", *numbers, f"{s.gaps}", _cell(s.largest_gap, 3))
         alike.setdefault(_columns(s.columns), []).append(s.name)
     console.print(table, soft_wrap=False)
     for columns, names in alike.items():
         console.print(f"{', '.join(names)}: {escape(columns)}")
     for note in flight.notes:
         console.print(f"note: {escape(note)}")
+    for doubt in doubts(flight):
+        console.print(f"[yellow]check[/yellow]: {escape(doubt)}")
     for name, reasons in flight.discarded.items():
         for reason, n in reasons.items():
             console.print(f"discarded: {escape(name)}: {n} samples, {escape(reason)}")

@@ -9,12 +9,13 @@ __all__ = ["SOLUTION", "STREAMS", "Column", "StreamSchema", "base_name", "column
 
 @dataclass(frozen=True)
 class Column:
-    """One column: its name, unit (SI; lat and lon in degrees), frame and meaning."""
+    """One column: its name, unit (SI; lat and lon in degrees), frame and meaning, and whether it holds words."""
 
     name: str
     unit: str
     frame: str
     doc: str
+    text: bool = False
 
 
 @dataclass(frozen=True)
@@ -78,6 +79,10 @@ STREAMS: dict[str, StreamSchema] = {
                 T,
                 *_xyz("gyro", "rad/s", "FRD", "angular rate"),
                 *_xyz("accel", "m/s^2", "FRD", "specific force (at rest, level: z = -9.81)"),
+                Column("gyro_clipping", "1", "FRD", "axes at the end of the gyro's range since the sample before: x 1 + y 2 + z 4"),
+                Column(
+                    "accel_clipping", "1", "FRD", "axes at the end of the accelerometer's range since the sample before: x 1 + y 2 + z 4"
+                ),
             ),
             ("t", "gyro_x", "gyro_y", "gyro_z", "accel_x", "accel_y", "accel_z"),
         ),
@@ -135,6 +140,26 @@ STREAMS: dict[str, StreamSchema] = {
         ),
         StreamSchema("onboard", "the autopilot's own solution", SOLUTION, ("t",)),
         StreamSchema("truth", "reference (motion capture, RTK, simulator)", SOLUTION, ("t",)),
+        StreamSchema(
+            "vibration",
+            "vibration of an IMU as the autopilot measured it: vibration.1 is that of imu.1",
+            (
+                T,
+                *_xyz("vibe", "m/s^2", "FRD", "standard deviation of specific force above 5 Hz"),
+                Column("clip", "1", "", "samples at the end of the accelerometer's range since boot"),
+            ),
+            ("t",),
+        ),
+        StreamSchema(
+            "modes",
+            "flight mode and arming: a row at the start and at each change, valid until the next",
+            (
+                T,
+                Column("mode", "1", "", "the autopilot's own mode name", text=True),
+                Column("armed", "1", "", "1 armed, 0 disarmed, NaN unknown"),
+            ),
+            ("t", "mode"),
+        ),
     )
 }
 

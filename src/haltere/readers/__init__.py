@@ -21,6 +21,9 @@ FORMATS: tuple[tuple[str, str], ...] = (
     ("haltere.flight.folder", "flight folder"),
     ("haltere.readers.px4", "PX4 ULog"),
     ("haltere.readers.ardupilot", "ArduPilot DataFlash"),
+    ("haltere.readers.ros", "ROS bag or MCAP"),
+    ("haltere.readers.blackbox", "Betaflight blackbox"),
+    ("haltere.readers.datcon", "DJI DatCon CSV"),
     ("haltere.readers.table", "CSV or Parquet table"),
 )
 
@@ -69,7 +72,7 @@ def read(path: Path | str, column_map: Mapping[str, str] | None = None) -> Fligh
     if module is None:
         raise HaltereError(
             f"a log in one of the formats {', '.join(name for _, name in FORMATS)}",
-            f"{path.stat().st_size} bytes of none of them",
+            "a folder without flight.toml" if path.is_dir() else f"{path.stat().st_size} bytes of none of them",
             str(path),
             "check that the file was copied whole; a table of your own needs a header line and a column map",
         )

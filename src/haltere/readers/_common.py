@@ -151,8 +151,11 @@ class Builder:
         return (int(found[0].min()), int(found[0].max())) if found else None
 
     def set_home(self, lat: float, lon: float, alt: float) -> None:
-        """Name the origin of positions."""
-        self.meta.home = Home(float(lat), float(lon), float(alt))
+        """Name the origin of positions; what cannot be a place is left out and told."""
+        if np.isfinite([lat, lon, alt]).all() and abs(lat) <= 90.0 and abs(lon) <= 360.0:
+            self.meta.home = Home(float(lat), float(lon), float(alt))
+        else:
+            self.note(f"home position left out: latitude {lat:.6g}, longitude {lon:.6g} deg, altitude {alt:.6g} m is no place")
 
     def build(self) -> FlightLog:
         """The flight, with t = 0 at the earliest sample of the navigation streams.

@@ -75,17 +75,22 @@ class Messages:
         return field in self.columns
 
     def get(self, *fields: str) -> FloatArray:
-        """First of several fields that is there, as float64; NaN where none is."""
+        """First of several fields that is there, as float64; NaN where none is, or where it is no number."""
         for field in fields:
             if field in self.columns:
-                return np.array(self.columns[field], dtype=np.float64)
+                values = self.columns[field]
+                if values.ndim > 1:  # of an array a message, which no number is
+                    break
+                return np.array(_numbers(self.texts(field)) if values.dtype.kind in "SU" else values, dtype=np.float64)
         return np.full(len(self), np.nan)
 
     def integers(self, *fields: str) -> IntArray | None:
         """First of several integer fields that is there, or None."""
         for field in fields:
             if field in self.columns:
-                whole: IntArray = np.nan_to_num(np.asarray(self.columns[field])).astype(np.int64)
+                values = self.columns[field]
+                exact = values.ndim == 1 and values.dtype.kind in "iu"
+                whole: IntArray = (values if exact else np.nan_to_num(self.get(field))).astype(np.int64)
                 return whole
         return None
 

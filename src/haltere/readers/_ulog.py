@@ -23,7 +23,7 @@ STRAY_LIMIT = 10_000
 TOPICS = (
     "sensor_combined vehicle_imu sensor_selection vehicle_magnetometer sensor_mag vehicle_air_data sensor_baro "
     "vehicle_gps_position sensor_gps airspeed_validated airspeed esc_status actuator_motors actuator_outputs battery_status "
-    "vehicle_attitude vehicle_local_position "
+    "vehicle_attitude vehicle_local_position vehicle_status "
     "vehicle_global_position estimator_sensor_bias estimator_selector_status wind wind_estimate home_position "
     "vehicle_attitude_groundtruth vehicle_local_position_groundtruth vehicle_global_position_groundtruth"
 ).split()
@@ -65,6 +65,10 @@ class Topic:
     def vector(self, field: str, out: str, scale: float = 1.0) -> Columns:
         """Three components ``field[0..2]`` as ``out_x, out_y, out_z``."""
         return {f"{out}_{a}": self.get(f"{field}[{i}]", scale=scale) for i, a in enumerate("xyz")}
+
+    def integers(self, field: str) -> IntArray | None:
+        """A field of whole numbers or flags, or None where it is not there."""
+        return np.nan_to_num(number(self.data[field])).astype(np.int64) if field in self.data else None
 
     def last(self, field: str) -> int | None:
         """Newest value of an integer field."""

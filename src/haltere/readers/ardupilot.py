@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -10,6 +11,7 @@ import numpy as np
 from haltere.readers._ardupilot_solution import add_solution, add_truth, primary
 from haltere.readers._common import RPM, Builder, Columns, FloatArray, IntArray
 from haltere.readers._dataflash import BINARY_HEAD, DataFlash, Messages, is_text_log
+from haltere.readers._modes import ARDUPILOT_MODES, add_modes, ardupilot_mode, spelt
 
 if TYPE_CHECKING:
     from haltere.flight.log import FlightLog
@@ -26,6 +28,8 @@ MOTOR_FUNCTIONS = {**{33 + i: i for i in range(8)}, **{82 + i: 8 + i for i in ra
 #: Motors by FRAME_CLASS: quad, hexa, octa, octaquad, Y6, tri, dodecahexa.
 MOTORS_BY_FRAME = {1: 4, 2: 6, 3: 8, 4: 8, 5: 6, 7: 3, 12: 12}
 INTEGER_LETTERS = "bBhHiI"
+#: Event numbers (EV) of arming and disarming, the same in all vehicles and generations.
+EVENT_ARMED, EVENT_DISARMED = 10, 11
 
 
 def sniff(path: Path, head: bytes) -> bool:
@@ -66,6 +70,8 @@ def read(path: Path) -> FlightLog:
     _add_airdata(log, builder)
     _add_rotors(log, builder, params)
     _add_power(log, builder)
+    _add_vibration(log, builder, params)
+    _add_modes(log, builder)
     add_solution(log, builder, params)
     add_truth(log, builder)
     for note in log.notes:
@@ -75,7 +81,10 @@ def read(path: Path) -> FlightLog:
 
 def _params(log: DataFlash) -> dict[str, float]:
     parm = log.get("PARM")
-    return dict(zip(parm.texts("Name"), parm.get("Value").tolist(), strict=True)) if parm is not None and "Name" in parm else {}
+    if parm is None or "Name" not in parm:
+        return {}
+    pairs = zip(parm.texts("Name"), parm.get("Value").tolist(), strict=True)
+    return {name: value for name, value in pairs if math.isfinite(value)}  # a damaged value is none
 
 
 def _version(log: DataFlash, builder: Builder) -> None:
@@ -334,3 +343,49 @@ def _add_power(log: DataFlash, builder: Builder) -> None:
 
     for i, (_, unit) in enumerate(units):
         builder.add(_name("power", i), log.us(unit), {"voltage": scaled(unit, "Volt"), "current": scaled(unit, "Curr")})
+
+
+def _add_vibration(log: DataFlash, builder: Builder, params: dict[str, float]) -> None:
+    """Vibration and clipping by unit, numbered as the imu streams are."""
+    first = log.get("VIBE")
+    if first is None:
+        return
+    units = [number for number, _ in _primary_first(_instances(log, "IMU", "IMU2", "IMU3"), primary(log, params, "imu"))]
+    levels = {f"vibe_{a}": first.get(f"Vibe{a.upper()}") for a in "xyz"}
+    instance = first.integers("IMU")
+    for i, number in enumerate(units or [0]):
+        if instance is not None:
+            unit = first.where(instance == number)
+            columns = {f"vibe_{a}": unit.get(f"Vibe{a.upper()}") for a in "xyz"} | {"clip": unit.get("Clip")}
+        else:  # one message for all units: levels of the first, clipping of each
+            unit = first
+            columns = (levels if number == 0 else {}) | {"clip": first.get(f"Clip{number}")}
+        if len(unit):
+            builder.add(_name("vibration", i), log.us(unit), columns)
+
+
+def _add_modes(log: DataFlash, builder: Builder) -> None:
+    mode = log.get("MODE")
+    names: list[str] = []
+    if mode is not None:
+        numbers = mode.integers("ModeNum")
+        if numbers is None and "Mode" in mode and np.asarray(mode.columns["Mode"]).dtype.kind in "iu":
+            numbers = mode.integers("Mode")
+        if numbers is not None:
+            source = builder.meta.source.replace("Solo", "Copter")
+            vehicle = next((v for v in ARDUPILOT_MODES if v in source), None)
+            names = [ardupilot_mode(int(n), vehicle) for n in numbers]
+        elif "Mode" in mode:
+            names = [spelt(name) for name in mode.texts("Mode")]
+    us = log.us(mode) if mode is not None and names else np.empty(0, np.int64)
+    arm = log.get("ARM")
+    event = log.get("EV")
+    numbers = event.integers("Id", "Event") if event is not None else None
+    if arm is not None and "ArmState" in arm:
+        armed = log.us(arm), np.asarray(arm.get("ArmState") != 0.0, dtype=np.float64)
+    elif event is not None and numbers is not None:
+        mine = (numbers == EVENT_ARMED) | (numbers == EVENT_DISARMED)
+        armed = log.us(event)[mine], np.asarray(numbers[mine] == EVENT_ARMED, dtype=np.float64)
+    else:
+        armed = np.empty(0, np.int64), np.empty(0)
+    add_modes(builder, (us, names), armed)

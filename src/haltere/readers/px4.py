@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from haltere.readers._common import GAUSS, RPM, UTC_FLOOR_US, Builder, Columns, IntArray
+from haltere.readers._modes import add_modes, px4_mode
 from haltere.readers._px4_solution import add_solution, add_truth, set_home
 from haltere.readers._ulog import MAGIC, Log, Topic
 
@@ -67,6 +68,7 @@ def read(path: Path) -> FlightLog:
         current = topic.get("current_a")
         current[current < 0.0] = np.nan  # -1: not measured
         builder.add("power" if i == 0 else f"power.{i}", topic.us, {"voltage": topic.get("voltage_v"), "current": current})
+    _add_modes(log, builder)
     set_home(log, builder)
     add_solution(log, builder)
     add_truth(log, builder)
@@ -93,7 +95,8 @@ def _add_imu(log: Log, builder: Builder) -> None:
             for values in accel.values():
                 values[lost] = np.nan
             builder.discard("imu", "accelerometer without a sample (rows kept, accel NaN)", int(lost.sum()))
-        builder.add("imu", combined.us, {**combined.vector("gyro_rad", "gyro"), **accel})
+        clipping = {"gyro_clipping": combined.get("gyro_clipping"), "accel_clipping": combined.get("accelerometer_clipping")}
+        builder.add("imu", combined.us, {**combined.vector("gyro_rad", "gyro"), **accel, **clipping})
         builder.meta.imu_kind = "mean"
         if primary in units:
             units.remove(primary)
@@ -222,6 +225,20 @@ def _add_airdata(log: Log, builder: Builder) -> None:
     builder.add("airdata", topic.us[keep], {"airspeed": speed[keep]})
 
 
+def _add_modes(log: Log, builder: Builder) -> None:
+    status = log.one("vehicle_status")
+    if status is None or "nav_state" not in status:
+        return
+    release = log.version.lstrip("v").split(".") if log.version else []
+    version = (int(release[0]), int(release[1])) if len(release) > 1 and release[0].isdigit() and release[1].isdigit() else None
+    numbers, rows = np.unique(status.data["nav_state"], return_inverse=True)
+    names = [px4_mode(int(n), version) for n in numbers]
+    state = status.get("arming_state")
+    # 3 was "armed with an error" in the first ULogs and "standby with an error" from then on.
+    armed = np.where((state == 3.0) | np.isnan(state), np.nan, state == 2.0)
+    add_modes(builder, (status.us, [names[i] for i in rows]), (status.us, armed))
+
+
 def _add_rotors(log: Log, builder: Builder) -> None:
     speeds = _rotor_speeds(log, builder)
     if speeds is not None:
@@ -238,7 +255,7 @@ def _rotor_speeds(log: Log, builder: Builder) -> tuple[IntArray, Columns] | None
     if esc is None:
         return None
     count = int(np.max(esc.get("esc_count"), initial=0)) if "esc_count" in esc else 12
-    online = esc.data.get("esc_online_flags")
+    online = esc.integers("esc_online_flags")
     functions = [esc.last(f"esc[{i}].actuator_function") or 0 for i in range(12)]
     columns: Columns = {}
     for i in range(12):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -9,48 +10,19 @@ import numpy as np
 from haltere.errors import HaltereError
 from haltere.flight.door import RATE_MIN, RATE_POOR, check
 from haltere.flight.log import FlightLog, Stream
-from haltere.flight.schema import column
+from haltere.flight.schema import base_name, column
+from haltere.readers._settings import settings_of
 
-__all__ = ["StreamSummary", "Support", "streams", "support"]
+__all__ = ["ESTIMATORS", "StreamSummary", "Support", "doubts", "streams", "support"]
 
 #: A hole is an interval longer than this many typical ones and this many seconds.
 GAP_FACTOR, GAP_SECONDS = 5.0, 0.1
 #: Holes in the IMU from which on [s] a solution is no longer continuous.
 COAST = 1.0
+#: Streams whose rows are events: they have no rate and no holes.
+EVENTS = ("modes",)
 #: Below this rate [Hz] rotor speeds show a failing motor too late.
 ROTOR_RATE = 50.0
-
-#: What to set on the vehicle, by autopilot and by what is missing.
-REMEDIES: dict[str, dict[str, str]] = {
-    "px4": {
-        "imu": "PX4: log the default topics (SDLOG_PROFILE bit 0) for sensor_combined at full rate, and bit 4 (high rate) for more",
-        "gaps": "PX4: a faster SD card, or fewer topics (SDLOG_PROFILE); the log's notes count the logger's dropouts",
-        "gnss": "PX4: log the default topics (SDLOG_PROFILE bit 0), which has vehicle_gps_position, and arm with a 3-D fix",
-        "magnetometer": "PX4: log the default topics (SDLOG_PROFILE bit 0), which has vehicle_magnetometer; check SYS_HAS_MAG",
-        "barometer": "PX4: log the default topics (SDLOG_PROFILE bit 0), which has vehicle_air_data; check SYS_HAS_BARO",
-        "rotors": "PX4: esc_status needs speed controllers with telemetry (bidirectional DShot, UAVCAN), and SDLOG_PROFILE bit 4 "
-        "(high rate) or etc/logging/logger_topics.txt on the SD card; the default is 4 Hz",
-        "still": "PX4: SDLOG_MODE 1 logs from boot, so that the vehicle is seen at rest before take-off",
-    },
-    "ardupilot": {
-        "imu": "ArduPilot: set bit 18 of LOG_BITMASK (fast IMU), or bit 19 (raw IMU); LOG_BITMASK bit 7 alone gives 25 Hz",
-        "gaps": "ArduPilot: a faster SD card or a larger LOG_FILE_BUFSIZE; separate flights: LOG_FILE_DSRMROT 1 starts a new log at each",
-        "gnss": "ArduPilot: set bit 2 of LOG_BITMASK (GPS), and arm with a 3-D fix",
-        "magnetometer": "ArduPilot: set bit 13 of LOG_BITMASK (compass)",
-        "barometer": "ArduPilot: firmware from 3.2 on logs BARO by itself; CTUN (bit 4 of LOG_BITMASK) holds its altitude before",
-        "rotors": "ArduPilot: ESC messages need telemetry: bidirectional DShot (SERVO_BLH_BDMASK) or CAN speed controllers",
-        "still": "ArduPilot: LOG_DISARMED 1 logs from boot, so that the vehicle is seen at rest before take-off",
-    },
-    "": {
-        "imu": "record gyro and accelerometer at 50 Hz or more, 200 Hz if you can",
-        "gaps": "record without holes, or cut the log into its flights",
-        "gnss": "record satellite position and velocity at 1 Hz or more",
-        "magnetometer": "record the magnetometer at 5 Hz or more",
-        "barometer": "record the barometer at 5 Hz or more",
-        "rotors": "record rotor speeds at 50 Hz or more",
-        "still": "begin to record some seconds before take-off",
-    },
-}
 
 
 @dataclass(frozen=True)
@@ -124,6 +96,8 @@ def _summary(name: str, stream: Stream) -> StreamSummary:
     nan = float("nan")
     if not len(t):
         return StreamSummary(name, len(stream), nan, nan, nan, nan, 0, nan, nan, units)
+    if base_name(name) in EVENTS:
+        return StreamSummary(name, len(stream), nan, nan, float(t.min()), float(t.max()), 0, nan, nan, units)
     steps = np.diff(t)
     span = float(t.max() - t.min())
     mean_rate = (len(t) - 1) / span if span > 0.0 else nan
@@ -136,7 +110,7 @@ def _summary(name: str, stream: Stream) -> StreamSummary:
 
 
 def support(flight: FlightLog) -> list[Support]:
-    """What ``navigator`` and ``ahrs`` can and cannot do with a flight.
+    """What each estimator can and cannot do with a flight.
 
     Parameters
     ----------
@@ -146,105 +120,161 @@ def support(flight: FlightLog) -> list[Support]:
     Returns
     -------
     list of Support
-        One an estimator. ``no``: it would refuse; ``limited``: it runs, with less than it could give.
+        One an estimator, in the order of `ESTIMATORS`. ``no``: it would refuse; ``limited``: it runs, with less than it could give.
     """
-    return [_judge(flight, "navigator"), _judge(flight, "ahrs")]
+    return [_judge(flight, estimator) for estimator in ESTIMATORS]
+
+
+def doubts(flight: FlightLog) -> list[str]:
+    """What the door would say of a flight besides its reader's own notes: units and axes that look wrong, clocks, stuck values."""
+    imu = flight.get("imu")
+    if imu is None or not len(imu):
+        return []
+    try:
+        checked = check(flight)
+    except HaltereError as error:
+        return [str(error)]
+    return [warning for warning in checked.warnings if warning not in flight.notes]
 
 
 class _Judgement:
+    """What is found of one estimator and one flight, collected ability by ability."""
+
     def __init__(self, flight: FlightLog) -> None:
-        source = flight.meta.source
-        kind = "px4" if source.startswith("PX4") else "ardupilot" if source.startswith("ArduPilot") else ""
-        self.known = REMEDIES[kind]
+        self.flight = flight
+        self.settings = settings_of(flight.meta.source)
         self.can: list[str] = []
         self.cannot: list[str] = []
         self.remedies: list[str] = []
 
-    def lacks(self, text: str, *keys: str) -> None:
+    def lacks(self, text: str, setting: str) -> None:
+        """Something that the estimator could do with a better log, and the setting for it."""
         self.cannot.append(text)
-        self.remedies += [self.known[k] for k in keys if self.known[k] not in self.remedies]
+        self.advise(self.settings[setting])
 
-    def result(self, estimator: str, verdict: str) -> Support:
-        return Support(estimator, verdict, tuple(self.can), tuple(self.cannot), tuple(self.remedies))
+    def advise(self, remedy: str) -> None:
+        """A setting that would help."""
+        if remedy not in self.remedies:
+            self.remedies.append(remedy)
+
+    def usable(self, name: str, *columns: str) -> bool:
+        """Whether a stream has values in all of several columns."""
+        stream = self.flight.get(name)
+        return stream is not None and all(np.isfinite(stream.get(c)).any() for c in columns)
+
+    @property
+    def fixed(self) -> bool:
+        """Whether there are three-dimensional fixes."""
+        gnss = self.flight.get("gnss")
+        good = gnss is not None and bool((np.nan_to_num(gnss.get("fix_type"), nan=3.0) >= 3.0).any())
+        return good and self.usable("gnss", "lat", "lon")
+
+    @property
+    def compass(self) -> bool:
+        """Whether there is a magnetic field."""
+        return self.usable("magnetometer", "mag_x", "mag_y", "mag_z")
 
 
 def _judge(flight: FlightLog, estimator: str) -> Support:
     out = _Judgement(flight)
     imu = flight.get("imu")
+    verdict = ""
     if imu is None or not len(imu):
         out.lacks("nothing: there is no imu stream", "imu")
-        return out.result(estimator, "no")
-    try:
-        check(flight.without(*(name for name in flight if name != "imu")))
-    except HaltereError as error:
-        out.lacks(f"nothing: {error}", "imu")
-        return out.result(estimator, "no")
-    numbers = _summary("imu", imu)
-    _judge_imu(out, numbers)
-    magnetometer = _usable(flight, "magnetometer", "mag_x", "mag_y", "mag_z")
-    if estimator == "ahrs":
-        out.can.append("roll and pitch")
-        if magnetometer:
-            out.can.append("heading from the magnetometer")
-        else:
-            out.lacks("heading: without a magnetometer it drifts", "magnetometer")
+        verdict = "no"
     else:
-        _judge_navigator(out, flight, magnetometer)
-    return out.result(estimator, "limited" if out.cannot else "yes")
+        try:
+            check(flight.without(*(name for name in flight if name != "imu")))
+        except HaltereError as error:
+            out.lacks(f"nothing: {error}", "imu")
+            verdict = "no"
+    if not verdict and imu is not None:
+        _sampling(out, _summary("imu", imu))
+        for ability in ESTIMATORS[estimator]:
+            ability(out)
+        verdict = "limited" if out.cannot else "yes"
+    return Support(estimator, verdict, tuple(out.can), tuple(out.cannot), tuple(out.remedies))
 
 
-def _judge_imu(out: _Judgement, numbers: StreamSummary) -> None:
-    if numbers.rate < RATE_POOR:
+# Abilities: each says what it finds of one thing that an estimator gives or needs
+
+
+def _sampling(out: _Judgement, imu: StreamSummary) -> None:
+    if imu.rate < RATE_POOR:
         out.lacks(
-            f"turns and vibration faster than the IMU's {numbers.rate:.3g} Hz "
+            f"turns and vibration faster than the IMU's {imu.rate:.3g} Hz "
             f"({RATE_POOR:.0f} Hz or more is good, {RATE_MIN:.0f} Hz the least)",
             "imu",
         )
-    if numbers.largest_gap > COAST:
-        many = "s" if numbers.gaps > 1 else ""
+    if imu.largest_gap > COAST:
+        many = "s" if imu.gaps > 1 else ""
         out.lacks(
-            f"one continuous solution: the imu has {numbers.gaps} gap{many}, the longest {numbers.largest_gap:.4g} s after "
-            f"t = {numbers.largest_gap_at:.1f} s; "
-            f"{numbers.rate:.3g} Hz in stretches is {numbers.mean_rate:.3g} Hz on average: too slow on the whole",
+            f"one continuous solution: the imu has {imu.gaps} gap{many}, the longest {imu.largest_gap:.4g} s after "
+            f"t = {imu.largest_gap_at:.1f} s; "
+            f"{imu.rate:.3g} Hz in stretches is {imu.mean_rate:.3g} Hz on average: too slow on the whole",
             "gaps",
         )
 
 
-def _judge_navigator(out: _Judgement, flight: FlightLog, magnetometer: bool) -> None:
-    gnss = flight.get("gnss")
-    fixed = gnss is not None and bool((np.nan_to_num(gnss.get("fix_type"), nan=3.0) >= 3.0).any()) and _usable(flight, "gnss", "lat", "lon")
-    barometer = _usable(flight, "barometer", "pressure") or _usable(flight, "barometer", "altitude")
+def _level(out: _Judgement) -> None:
+    out.can.append("roll and pitch")
+
+
+def _attitude(out: _Judgement) -> None:
     out.can.append("attitude")
-    if fixed and gnss is not None:
-        out.can.append("velocity and position")
-        if not _usable(flight, "gnss", "vel_n", "vel_e"):
-            out.lacks("velocity measured by GNSS: only positions are there", "gnss")
-        elif not _usable(flight, "gnss", "vel_d"):
-            out.lacks("vertical velocity measured by GNSS", "gnss")
-    else:
-        reason = "no 3-D fix in the gnss stream" if gnss is not None else "no gnss stream"
+
+
+def _velocity_and_position(out: _Judgement) -> None:
+    if not out.fixed:
+        reason = "no 3-D fix in the gnss stream" if "gnss" in out.flight else "no gnss stream"
         out.lacks(f"horizontal velocity and position: {reason}", "gnss")
-    if barometer:
+        return
+    out.can.append("velocity and position")
+    if not out.usable("gnss", "vel_n", "vel_e"):
+        out.lacks("velocity measured by GNSS: only positions are there", "gnss velocity")
+    elif not out.usable("gnss", "vel_d"):
+        out.lacks("vertical velocity measured by GNSS", "gnss velocity")
+
+
+def _height(out: _Judgement) -> None:
+    if out.usable("barometer", "pressure") or out.usable("barometer", "altitude"):
         out.can.append("height from the barometer")
     else:
-        out.lacks("barometric height: GNSS height alone is metres worse" if fixed else "height: neither barometer nor GNSS", "barometer")
-    if magnetometer:
+        missing = "barometric height: GNSS height alone is metres worse" if out.fixed else "height: neither barometer nor GNSS"
+        out.lacks(missing, "barometer")
+
+
+def _heading(out: _Judgement) -> None:
+    if out.compass:
         out.can.append("heading from the magnetometer")
-    elif fixed:
+    else:
+        out.lacks("heading: without a magnetometer it drifts", "magnetometer")
+
+
+def _heading_or_course(out: _Judgement) -> None:
+    if out.compass:
+        out.can.append("heading from the magnetometer")
+    elif out.fixed:
         out.lacks("heading before the vehicle accelerates: no magnetometer", "magnetometer")
     else:
         out.lacks("heading: neither magnetometer nor GNSS velocity", "magnetometer")
-    rotors = flight.get("rotors")
+
+
+def _rotors(out: _Judgement) -> None:
+    """Not an ability that the estimator lacks: fault detection watches rotor speeds besides it."""
+    rotors = out.flight.get("rotors")
     speeds = rotors is not None and any(c.startswith("speed_") for c in rotors.names)
+    remedy = out.settings["rotors"]
     if rotors is not None and speeds and rotors.rate >= ROTOR_RATE:
         out.can.append("rotor speeds fast enough to watch the vehicle model")
     elif rotors is not None and speeds:
-        wanted = f"{rotors.rate:.3g} Hz here, {ROTOR_RATE:.0f} Hz wanted"
-        out.remedies.append(f"for fault detection by rotor speeds ({wanted}): {out.known['rotors']}")
+        out.advise(f"for fault detection by rotor speeds ({rotors.rate:.3g} Hz here, {ROTOR_RATE:.0f} Hz wanted): {remedy}")
     else:
-        out.remedies.append(f"for fault detection by rotor speeds: {out.known['rotors']}")
+        out.advise(f"for fault detection by rotor speeds: {remedy}")
 
 
-def _usable(flight: FlightLog, name: str, *columns: str) -> bool:
-    stream = flight.get(name)
-    return stream is not None and all(np.isfinite(stream.get(c)).any() for c in columns)
+#: What is looked at for each estimator, one line each; a new estimator is a line here.
+ESTIMATORS: dict[str, tuple[Callable[[_Judgement], None], ...]] = {
+    "navigator": (_attitude, _velocity_and_position, _height, _heading_or_course, _rotors),
+    "ahrs": (_level, _heading),
+}

@@ -11,9 +11,10 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from haltere.errors import HaltereError
-from haltere.flight.folder import to_column
+from haltere.flight.folder import csv_table, parquet_table, to_column
 from haltere.flight.log import FlightLog, FlightMeta, Stream
 from haltere.flight.schema import NAVIGATION_STREAMS, STREAMS, base_name, column
+from haltere.flight.units import UNITS, unit_word
 from haltere.readers._common import FloatArray, unusable
 
 if TYPE_CHECKING:
@@ -21,27 +22,6 @@ if TYPE_CHECKING:
 
 __all__ = ["UNITS", "read", "sniff"]
 
-#: Factor and offset to the schema's unit, by that unit and the unit of the source: value = factor * source + offset.
-UNITS: dict[str, dict[str, tuple[float, float]]] = {
-    "s": {"s": (1.0, 0.0), "ms": (1e-3, 0.0), "us": (1e-6, 0.0), "ns": (1e-9, 0.0)},
-    "rad/s": {"rad/s": (1.0, 0.0), "deg/s": (np.pi / 180.0, 0.0), "mrad/s": (1e-3, 0.0), "rpm": (2.0 * np.pi / 60.0, 0.0)},
-    "m/s^2": {"m/s^2": (1.0, 0.0), "g": (9.80665, 0.0), "mg": (9.80665e-3, 0.0)},
-    "uT": {"uT": (1.0, 0.0), "mT": (1e3, 0.0), "T": (1e6, 0.0), "nT": (1e-3, 0.0), "G": (100.0, 0.0), "mG": (0.1, 0.0)},
-    "Pa": {"Pa": (1.0, 0.0), "hPa": (100.0, 0.0), "mbar": (100.0, 0.0), "kPa": (1e3, 0.0)},
-    "deg": {"deg": (1.0, 0.0), "rad": (180.0 / np.pi, 0.0), "1e-7deg": (1e-7, 0.0)},
-    "rad": {"rad": (1.0, 0.0), "deg": (np.pi / 180.0, 0.0), "mrad": (1e-3, 0.0)},
-    "m": {"m": (1.0, 0.0), "mm": (1e-3, 0.0), "cm": (1e-2, 0.0), "km": (1e3, 0.0), "ft": (0.3048, 0.0)},
-    "m/s": {"m/s": (1.0, 0.0), "cm/s": (1e-2, 0.0), "mm/s": (1e-3, 0.0), "km/h": (1.0 / 3.6, 0.0), "kt": (1852.0 / 3600.0, 0.0)},
-    "V": {"V": (1.0, 0.0), "mV": (1e-3, 0.0)},
-    "A": {"A": (1.0, 0.0), "mA": (1e-3, 0.0)},
-    "degC": {"degC": (1.0, 0.0), "K": (1.0, -273.15)},
-    "1": {"1": (1.0, 0.0), "%": (1e-2, 0.0)},
-}
-ALIASES = {
-    **{"µs": "us", "μs": "us", "µT": "uT", "μT": "uT", "°": "deg", "°/s": "deg/s", "dps": "deg/s", "°C": "degC", "C": "degC"},
-    **{"m/s2": "m/s^2", "m/s²": "m/s^2", "m/s/s": "m/s^2", "gauss": "G", "mgauss": "mG", "milligauss": "mG"},
-    **{"degE7": "1e-7deg", "knots": "kt", "-": "1"},
-}
 WITH_UNIT = re.compile(r"^(?P<name>.*?)\s*\[(?P<unit>[^\[\]]*)\]\s*$", re.DOTALL)
 WORD = re.compile(r"^\s*\"?[A-Za-z_][^\x00-\x1f]*\"?\s*$")
 PARQUET = b"PAR1"
@@ -51,29 +31,15 @@ EXAMPLE = 'e.g. {"imu.t": "time_us [us]", "imu.gyro_x": "gx [deg/s]", "imu.accel
 
 
 def sniff(path: Path, head: bytes) -> bool:
-    """Whether a file is a Parquet table, or text with a header line of names and rows of as many fields."""
+    """Whether a file is a Parquet table, or text whose first line is one of names."""
     if head.startswith(PARQUET):
         return True
-    if b"\0" in head:
-        return False
-    try:
-        text = head.decode("utf-8")
-    except UnicodeDecodeError as error:
-        if error.start < len(head) - 4:  # not just a letter cut by the end of the head
-            return False
-        text = head[: error.start].decode("utf-8")
-    lines = [line for line in text.lstrip("\ufeff").splitlines() if line.strip() and not line.startswith("#")][:2]
-    if not lines:
-        return False
-    mark = _delimiter(lines[0])
-    fields = lines[0].split(mark)
-    named = [bool(WORD.match(f)) for f in fields]
-    # A nameless column is the row number that some tools write.
-    return (
-        sum(named) > 1
-        and all(n or not f.strip(' "') for n, f in zip(named, fields, strict=True))
-        and (len(lines) < 2 or len(lines[1].split(mark)) == len(fields))
-    )
+    # The header alone decides; damage further down is told by the reader, with its line.
+    header = next((line for line in _lines(head) if line.strip() and not line.startswith("#")), "")
+    fields = header.split(_delimiter(header))
+    named = sum(bool(WORD.match(f)) for f in fields)
+    # A nameless column is the row number that some tools write; one that is no name is damage.
+    return named > 1 and 2 * named > sum(bool(f.strip(' "')) for f in fields) and "\0" not in header
 
 
 def read(path: Path, column_map: Mapping[str, str] | None = None) -> FlightLog:
@@ -123,7 +89,7 @@ def read(path: Path, column_map: Mapping[str, str] | None = None) -> FlightLog:
     for name, part in streams.items():
         part["t"] = part["t"] - start
         if base_name(name) in ("magnetometer", "gnss", "barometer") and _held(part):
-            notes.append(f"{name}: most rows repeat the row before, as if held between updates; each counts as a sample")
+            notes.append(f"{name}: most rows repeat the row before, as if held between updates")
     meta = FlightMeta(name=path.stem, source=f"table: {path.name}", time_offset=start)
     return FlightLog({name: Stream(part) for name, part in streams.items()}, meta, notes, discarded)
 
@@ -139,26 +105,26 @@ def _held(part: dict[str, FloatArray]) -> bool:
     return len(rows) > 10 and float(np.mean(np.all((rows[1:] == rows[:-1]) | np.isnan(rows[1:]), axis=1))) > 0.5
 
 
+def _lines(data: bytes) -> list[str]:
+    return data.decode("utf-8-sig", "replace").splitlines()
+
+
 def _delimiter(line: str) -> str:
     return max(",;\t", key=line.count)
 
 
 def _load(path: Path) -> pl.DataFrame:
-    import polars as pl
-
-    try:
-        with path.open("rb") as file:
-            head = file.read(65536)
-        if head.startswith(PARQUET):
-            return pl.read_parquet(path)
-        if b"\0" in head:
-            raise unusable(path, "a CSV or Parquet table", "binary content of another kind")
-        lines = [line for line in head.decode("utf-8", "replace").splitlines() if line.strip() and not line.startswith("#")]
-        mark = _delimiter(lines[0]) if lines else ","
-        table = pl.read_csv(path, separator=mark, infer_schema_length=0, comment_prefix="#")
-        return table.rename({name: name.strip() for name in table.columns})
-    except (pl.exceptions.PolarsError, OSError) as error:
-        raise unusable(path, "a CSV or Parquet table", f"one that cannot be read ({str(error).splitlines()[0]})") from error
+    with path.open("rb") as file:
+        head = file.read(65536)
+    if head.startswith(PARQUET):
+        return parquet_table(path)
+    lines = [line for line in _lines(head) if line.strip() and not line.startswith("#")]
+    table = csv_table(path, _delimiter(lines[0]) if lines else ",", "#")
+    names = [name.strip() for name in table.columns]
+    for name in names:
+        if names.count(name) > 1:
+            raise unusable(path, "columns with names of their own", f"{names.count(name)} columns {name!r}", "rename one of them")
+    return table.rename(dict(zip(table.columns, names, strict=True)))
 
 
 def _split_unit(text: str) -> tuple[str, str]:
@@ -240,7 +206,7 @@ def _values(table: pl.DataFrame, source: str, unit: str, target_unit: str, path:
     """One column in the schema's unit."""
     name = source if source in table.columns else source.lstrip("-")
     allowed = UNITS[target_unit]
-    unit = ALIASES.get(unit, unit) or target_unit
+    unit = unit_word(unit) or target_unit
     if unit not in allowed:
         found = f"[{unit}] of column {name!r}"
         raise HaltereError(f"a unit that can be turned into {target_unit}", found, str(path), f"known: {', '.join(allowed)}")
