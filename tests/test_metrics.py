@@ -350,6 +350,7 @@ def test_health_is_read_off_the_innovations(bad: float, forced: bool, verdict: s
     n = 1000
     status = np.where(np.arange(n) < bad * n, "rejected", "fused")
     aids = {"sensor": np.full(n, "gnss"), "innovation": np.ones(n), "innovation_sd": np.ones(n), "status": status, "reason": np.full(n, "")}
+    aids |= {"t": 0.02 * np.arange(n), "component": np.full(n, "vel_n")}
     events = [{"kind": "timeout", "sensor": "gnss"}] if forced else []
     solution = solution_of(T, TURN, OFFSET_V, OFFSET_P)
     solution.aids, solution.events = aids, events
@@ -358,7 +359,10 @@ def test_health_is_read_off_the_innovations(bad: float, forced: bool, verdict: s
     summarise(solution, flight, facts)
     assert solution.summary["health"]["gnss"]["verdict"] == verdict
     assert solution.summary["streams"]["gnss"]["discarded"] == {"no 3-D fix": 3}
-    assert solution.summary["streams"]["imu"] == {"n": 200, "rate": pytest.approx(10.0), "gaps": 0, "discarded": {}}
+    imu = solution.summary["streams"]["imu"]
+    assert (imu["n"], imu["gaps"], imu["discarded"]) == (200, 0, {})
+    assert (imu["rate"], imu["mean_rate"]) == pytest.approx((10.0, 10.0))
+    assert imu["longest_gap"] == pytest.approx(0.1)
     assert solution.summary["errors"]["truth"]["pos_n"]["rms"] == pytest.approx(1.0)
     assert "onboard" not in solution.summary["errors"]
     assert solution.summary["warnings"] == ["one"]

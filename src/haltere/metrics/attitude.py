@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["conjugate", "euler", "multiply", "rotation_vector", "slerp"]
+__all__ = ["conjugate", "euler", "heading_between", "multiply", "rotation_vector", "slerp", "tilt_between"]
 
 FloatArray = NDArray[np.float64]
 
@@ -62,3 +62,15 @@ def slerp(t: FloatArray, tq: FloatArray, q: FloatArray) -> FloatArray:
     angle = np.linalg.norm(half, axis=1, keepdims=True)
     step = np.concatenate([np.cos(angle), half * np.sinc(angle / np.pi)], axis=1)
     return multiply(q[i], step)
+
+
+def tilt_between(a: FloatArray, b: FloatArray) -> FloatArray:
+    """Angle [rad] (n,) between the verticals that two attitudes q_nb (n, 4) see from the body; heading does not enter."""
+    w, x, y, z = np.moveaxis(multiply(a, conjugate(b)), -1, 0)
+    return np.asarray(2.0 * np.arctan2(np.hypot(x, y), np.hypot(w, z)))
+
+
+def heading_between(a: FloatArray, b: FloatArray) -> FloatArray:
+    """Turn about the vertical [rad] (n,), within a half turn, that is left of a ⊗ b⁻¹ (q_nb, (n, 4)) without its tilt."""
+    w, _, _, z = np.moveaxis(multiply(a, conjugate(b)), -1, 0)
+    return np.asarray(2.0 * np.arctan2(np.where(w < 0.0, -z, z), np.abs(w)))

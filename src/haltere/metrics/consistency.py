@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -11,23 +12,26 @@ from haltere.flight.log import Stream
 from haltere.flight.solution import Solution
 from haltere.metrics.attitude import conjugate, multiply, rotation_vector, slerp
 from haltere.metrics.errors import reference_position
+from haltere.metrics.whiteness import assumed
 
-__all__ = ["BLOCKS", "band", "nees_series", "nees_table", "nis_table"]
+__all__ = ["BLOCKS", "DOF", "WINDOW", "NisSeries", "band", "nees_series", "nees_table", "nis_series", "nis_table"]
 
 FloatArray = NDArray[np.float64]
 #: Blocks of the error state, in order.
 BLOCKS = ("attitude", "velocity", "position", "gyro_bias", "accel_bias", "baro_bias")
 #: Degrees of freedom of each.
 DOF = dict.fromkeys(BLOCKS, 3) | {"baro_bias": 1}
+#: Measurements in the moving mean of the NIS: few enough to show when, enough for a band of about 0.5 to 1.6 (one component).
+WINDOW = 25
 
 
 def band(dof: float, n: float, probability: float = 0.95) -> tuple[float, float]:
     """Interval in which the mean of n independent χ²(dof), divided by dof, lies with this probability."""
-    from scipy.stats import chi2
+    from scipy.special import gammaincinv  # quantiles of χ²(k) are twice those of the gamma distribution k/2; scipy.stats loads for long
 
-    tail = 0.5 * (1.0 - probability)
-    low, high = chi2.ppf([tail, 1.0 - tail], dof * n)
-    return float(low / (dof * n)), float(high / (dof * n))
+    tail, k = 0.5 * (1.0 - probability), dof * n
+    low, high = (2.0 * gammaincinv(0.5 * k, q) for q in (tail, 1.0 - tail))
+    return float(low / k), float(high / k)
 
 
 def nis_table(solution: Solution) -> dict[str, dict[str, Any]]:
@@ -52,6 +56,50 @@ def nis_table(solution: Solution) -> dict[str, dict[str, Any]]:
             "deweighted": int(np.count_nonzero(aids["status"][rows] == "deweighted")),
         }
     return out
+
+
+@dataclass(frozen=True)
+class NisSeries:
+    """Moving mean of a sensor's NIS a component: middle times, means, and the χ² band of each, all (n,)."""
+
+    t: FloatArray
+    mean: FloatArray
+    low: FloatArray
+    high: FloatArray
+
+
+def nis_series(solution: Solution, window: int = WINDOW) -> dict[tuple[str, str], NisSeries]:
+    """Moving mean of the squared normalised innovations over ``window`` fused measurements, by sensor and quantity.
+
+    The components of one measurement count as that many degrees of freedom: quantities are ``vel``, ``pos``, ``mag`` or a scalar's
+    own name. What was refused or de-weighted is left out as in `nis_table`, and so are assumptions and quantities with fewer
+    measurements than the window.
+    """
+    a = solution.aids
+    out: dict[tuple[str, str], NisSeries] = {}
+    good = (a["status"] == "fused") & (a["reason"] != "start") & (a["innovation_sd"] > 0.0) & np.isfinite(a["innovation"])
+    for sensor in (str(s) for s in np.unique(a["sensor"][good])):
+        if assumed(sensor):
+            continue
+        rows = np.flatnonzero(good & (a["sensor"] == sensor))
+        stems = np.array([c.rpartition("_")[0] or c for c in a["component"][rows].tolist()])
+        for stem in dict.fromkeys(stems.tolist()):
+            mine = rows[stems == stem]
+            t, which, parts = np.unique(a["t"][mine], return_inverse=True, return_counts=True)
+            if len(t) < window:
+                continue
+            ratio = (a["innovation"][mine] / a["innovation_sd"][mine]) ** 2
+            squares = np.asarray(np.bincount(which.ravel(), ratio, len(t)), np.float64)
+            total, dof = _moving_sum(squares, window), _moving_sum(parts.astype(np.float64), window)
+            kinds, back = np.unique(np.rint(dof), return_inverse=True)
+            bands = np.array([band(1.0, n) for n in kinds])[back.ravel()]
+            out[sensor, stem] = NisSeries(_moving_sum(t, window) / window, total / dof, bands[:, 0], bands[:, 1])
+    return out
+
+
+def _moving_sum(x: FloatArray, window: int) -> FloatArray:
+    """Sums over every ``window`` successive values, (n - window + 1,)."""
+    return np.asarray(np.lib.stride_tricks.sliding_window_view(x, window).sum(axis=1))
 
 
 def nees_series(solution: Solution, truth: Stream) -> dict[str, tuple[FloatArray, FloatArray]]:

@@ -11,22 +11,32 @@ from numpy.typing import NDArray
 from haltere.flight.local import local_from_geodetic
 from haltere.flight.log import Stream
 from haltere.flight.solution import Solution
-from haltere.metrics.attitude import conjugate, euler, multiply, rotation_vector, slerp
+from haltere.metrics.attitude import conjugate, euler, heading_between, multiply, rotation_vector, slerp, tilt_between
 
-__all__ = ["attitude_error", "error_series", "error_table", "reference_position"]
+__all__ = ["ANGLES", "attitude_error", "between", "error_series", "error_table", "lengths", "reference_position", "settling_time", "since"]
 
 FloatArray = NDArray[np.float64]
 Series = dict[str, tuple[FloatArray, FloatArray]]
+#: Errors that are angles [rad]. Attitude is the whole rotation, tilt and heading its parts off and about the vertical (the total,
+#: inclination and heading errors of D. Laidig et al., BROAD, Data 6(7), 2021); roll, pitch and yaw are differences of Euler angles.
+ANGLES = ("roll", "pitch", "yaw", "attitude", "tilt", "heading")
+#: Vectors and their axes.
+VECTORS = {"vel": "ned", "pos": "ned", "wind": "ned", "gyro_bias": "xyz", "accel_bias": "xyz"}
 
 
-def _inside(solution: Solution, t: FloatArray, gap: float = 0.5) -> NDArray[np.bool_]:
-    """Reference times between two solution rows that are not further apart than ``gap`` [s]."""
-    if len(solution) < 2:
+def between(rows: FloatArray, t: FloatArray, gap: float = 0.5) -> NDArray[np.bool_]:
+    """Times ``t`` (m,) that lie between two of the increasing ``rows`` (n,) not further apart than ``gap`` [s]."""
+    if len(rows) < 2:
         return np.zeros(len(t), bool)
-    i = np.clip(np.searchsorted(solution.t, t, side="right") - 1, 0, len(solution) - 2)
-    inside = (t >= solution.t[0]) & (t <= solution.t[-1])
-    inside &= solution.t[i + 1] - solution.t[i] <= gap
+    i = np.clip(np.searchsorted(rows, t, side="right") - 1, 0, len(rows) - 2)
+    inside = (t >= rows[0]) & (t <= rows[-1])
+    inside &= rows[i + 1] - rows[i] <= gap
     return np.asarray(inside)
+
+
+def _inside(solution: Solution, t: FloatArray) -> NDArray[np.bool_]:
+    """Reference times that the solution reaches."""
+    return between(solution.t, t)
 
 
 def attitude_error(solution: Solution, reference: Stream) -> tuple[FloatArray, FloatArray, FloatArray]:
@@ -41,15 +51,25 @@ def attitude_error(solution: Solution, reference: Stream) -> tuple[FloatArray, F
     euler_error : (m, 3)
         Roll, pitch, yaw of the solution minus the reference's, wrapped [rad].
     """
-    q_ref = reference.vector("q", "wxyz")
-    good = np.isfinite(q_ref).all(axis=1) & _inside(solution, reference.t)
-    t, q_ref = reference.t[good], q_ref[good]
+    t, q, q_ref = _attitudes(solution, reference, _inside(solution, reference.t))
     if len(t) == 0:
         return t, np.empty((0, 3)), np.empty((0, 3))
-    q_ref = q_ref / np.linalg.norm(q_ref, axis=1, keepdims=True)
-    q = slerp(t, solution.t, solution.vector("q", "wxyz"))
-    difference = euler(q) - euler(q_ref)
-    return t, rotation_vector(multiply(conjugate(q), q_ref)), (difference + math.pi) % (2.0 * math.pi) - math.pi
+    return t, rotation_vector(multiply(conjugate(q), q_ref)), _wrapped(euler(q) - euler(q_ref))
+
+
+def _attitudes(solution: Solution, reference: Stream, inside: NDArray[np.bool_]) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Times, and unit quaternions of solution and reference at them, where both have one."""
+    q_ref = reference.vector("q", "wxyz")
+    good = np.isfinite(q_ref).all(axis=1) & inside
+    t, q_ref = reference.t[good], q_ref[good]
+    if len(t) == 0:
+        return t, np.empty((0, 4)), np.empty((0, 4))
+    q_ref = q_ref / np.sqrt(np.einsum("ij,ij->i", q_ref, q_ref))[:, None]
+    return t, slerp(t, solution.t, solution.vector("q", "wxyz")), q_ref
+
+
+def _wrapped(angle: FloatArray) -> FloatArray:
+    return np.asarray((angle + math.pi) % (2.0 * math.pi) - math.pi)
 
 
 def reference_position(reference: Stream, origin: list[float] | None) -> tuple[FloatArray, FloatArray]:
@@ -70,39 +90,91 @@ def reference_position(reference: Stream, origin: list[float] | None) -> tuple[F
 
 
 def error_series(solution: Solution, reference: Stream) -> Series:
-    """Errors, solution minus reference, by name: ``(t, error)`` with angles in rad; only what both sides have."""
+    """Errors, solution minus reference, by name: ``(t, error)`` with angles in rad; only what both sides have.
+
+    Names are those of `ANGLES` (attitude and tilt without sign) and the components of velocity, position, wind and biases.
+    """
     out: Series = {}
-    t, rotvec, angles = attitude_error(solution, reference)
+    inside = _inside(solution, reference.t)
+    t, q, q_ref = _attitudes(solution, reference, inside)
     if len(t):
+        angles = _wrapped(euler(q) - euler(q_ref))
         for k, name in enumerate(("roll", "pitch", "yaw")):
             out[name] = (t, angles[:, k])
-        out["attitude"] = (t, np.linalg.norm(rotvec, axis=1))
-    if "vel_n" in solution:
-        v = reference.vector("vel", "ned")
-        for k, a in enumerate("ned"):
-            good = np.isfinite(v[:, k]) & _inside(solution, reference.t)
+        out["attitude"] = (t, np.linalg.norm(rotation_vector(multiply(conjugate(q), q_ref)), axis=1))
+        out["tilt"], out["heading"] = (t, tilt_between(q, q_ref)), (t, heading_between(q, q_ref))
+    for stem, axes in VECTORS.items():
+        times, values, within = reference.t, reference, inside
+        if stem == "pos":
+            if "pos_n" not in solution:
+                continue
+            times, p = reference_position(reference, solution.summary.get("origin"))
+            values = Stream({"t": times} | {f"pos_{a}": p[:, k] for k, a in enumerate(axes)})
+            within = _inside(solution, times)
+        for name in (f"{stem}_{a}" for a in axes):
+            if name not in solution or name not in values:
+                continue
+            good = np.isfinite(values[name]) & within
             if good.any():
-                out[f"vel_{a}"] = (reference.t[good], np.interp(reference.t[good], solution.t, solution[f"vel_{a}"]) - v[good, k])
-        tp, p = reference_position(reference, solution.summary.get("origin"))
-        for k, a in enumerate("ned"):
-            good = np.isfinite(p[:, k]) & _inside(solution, tp)
-            if good.any():
-                out[f"pos_{a}"] = (tp[good], np.interp(tp[good], solution.t, solution[f"pos_{a}"]) - p[good, k])
-    for stem in ("gyro_bias", "accel_bias"):
-        for a in "xyz":
-            name = f"{stem}_{a}"
-            if name in solution and name in reference:
-                good = np.isfinite(reference[name]) & _inside(solution, reference.t)
-                if good.any():
-                    out[name] = (reference.t[good], np.interp(reference.t[good], solution.t, solution[name]) - reference[name][good])
+                out[name] = (times[good], np.interp(times[good], solution.t, solution[name]) - values[name][good])
     return out
+
+
+def lengths(series: Series) -> Series:
+    """Lengths of the error vectors (``vel``, ``pos``, ``wind``, ``gyro_bias``, ``accel_bias``) of which every component is there.
+
+    Wind counts its horizontal part where an estimator has no other.
+    """
+    out: Series = {}
+    for stem, axes in VECTORS.items():
+        names = [f"{stem}_{a}" for a in axes if stem != "wind" or a != "d" or "wind_d" in series]
+        if any(name not in series for name in names):
+            continue
+        t = series[names[0]][0]
+        if all(np.array_equal(series[name][0], t) for name in names[1:]):
+            out[stem] = (t, np.sqrt(sum(series[name][1] ** 2 for name in names)))
+    return out
+
+
+def since(series: Series, begin: float, end: float = math.inf) -> Series:
+    """The same errors at times from ``begin`` to ``end`` [s]; names with none are left out."""
+    kept = {name: (t >= begin) & (t <= end) for name, (t, _) in series.items()}
+    return {name: (t[kept[name]], e[kept[name]]) for name, (t, e) in series.items() if kept[name].any()}
+
+
+def settling_time(t: FloatArray, error: FloatArray, bound: float, begin: float | None = None) -> float:
+    """Time [s] from ``begin`` until an error stays within a bound to its end.
+
+    Parameters
+    ----------
+    t, error
+        Times [s] and errors (n,), rising; those before ``begin`` do not count.
+    bound
+        In the error's unit, on its magnitude; equal is within.
+    begin
+        Where time counts from; by default the first row.
+
+    Returns
+    -------
+    float
+        0 where it never was outside, NaN where it is outside at its last row or has no row.
+    """
+    begin = float(t[0]) if begin is None and len(t) else begin
+    if begin is None:
+        return math.nan
+    after = t >= begin
+    t, outside = t[after], ~(np.abs(error[after]) <= bound)
+    if len(t) == 0 or outside[-1]:
+        return math.nan
+    rows = np.flatnonzero(outside)
+    return float(t[rows[-1] + 1] - begin) if len(rows) else 0.0
 
 
 def error_table(series: Series) -> dict[str, dict[str, float]]:
     """RMS and largest absolute error by name; angles in degrees under ``*_deg``."""
     out: dict[str, dict[str, float]] = {}
     for name, (_, error) in series.items():
-        angle = name in ("roll", "pitch", "yaw", "attitude")
+        angle = name in ANGLES
         k = 180.0 / math.pi if angle else 1.0
         e = k * error
         row: dict[str, Any] = {"rms": float(np.sqrt(np.mean(e * e))), "max": float(np.max(np.abs(e))), "n": len(e)}

@@ -8,10 +8,12 @@ from typing import Any
 import numpy as np
 
 from haltere._version import __version__
-from haltere.flight.log import FlightLog
+from haltere.flight.log import FlightLog, Stream
 from haltere.flight.solution import Solution
 from haltere.metrics.consistency import nees_series, nees_table, nis_table
 from haltere.metrics.errors import error_series, error_table
+from haltere.metrics.sensors import findings, sampling, sensor_table
+from haltere.metrics.whiteness import whiteness_series, whiteness_table
 
 __all__ = ["finite", "gaps_of", "summarise"]
 
@@ -27,6 +29,15 @@ def gaps_of(t: np.ndarray[Any, np.dtype[np.float64]]) -> int:
     return int(np.count_nonzero(dt > max(4.0 * middle, 0.1)))
 
 
+def _attitudes(stream: Stream) -> Stream:
+    """The rows of a solution that hold its attitude: rows of several topics lie between each other, and have no rate together."""
+    return stream.where(np.isfinite(stream["q_w"])) if "q_w" in stream else stream
+
+
+def _timing(stream: Stream) -> dict[str, Any]:
+    return {"rate": stream.rate, "gaps": gaps_of(stream.t), **sampling(stream.t)}
+
+
 def finite(value: Any) -> Any:
     """The same with numbers that are not finite as None, for JSON."""
     if isinstance(value, dict):
@@ -38,9 +49,10 @@ def finite(value: Any) -> Any:
     return value
 
 
-def summarise(solution: Solution, flight: FlightLog, facts: dict[str, Any]) -> None:
+def summarise(solution: Solution, flight: FlightLog, facts: dict[str, Any], scored: bool = True) -> None:
     """Fill ``solution.summary`` from the solution, the flight it is of, and what the run knows.
 
+    Without ``scored`` it holds no errors and no NEES, of streams only counts, and nothing of what sensors show by themselves.
     Only here, after the run, are ``onboard`` and ``truth`` read.
     """
     meta = flight.meta
@@ -57,17 +69,17 @@ def summarise(solution: Solution, flight: FlightLog, facts: dict[str, Any]) -> N
     summary["duration"] = facts["duration"]
     summary["rows"] = len(solution)
     summary["streams"] = {
-        name: {
-            "n": len(stream), "rate": stream.rate, "gaps": gaps_of(stream.t), "discarded": facts["discarded"].get(name, {}),
-        }
+        name: {"n": len(stream), **(_timing(_attitudes(stream)) if scored else {}), "discarded": facts["discarded"].get(name, {})}
         for name, stream in flight.streams.items()
-    }  # fmt: skip
-    summary["errors"] = {
-        name: error_table(error_series(solution, flight[name])) for name in ("truth", "onboard") if name in flight and len(flight[name])
     }
+    references = [name for name in ("truth", "onboard") if name in flight and len(flight[name])] if scored else []
+    summary["errors"] = {name: error_table(error_series(solution, flight[name])) for name in references}
     summary["nis"] = nis_table(solution)
-    summary["nees"] = nees_table(nees_series(solution, flight["truth"])) if "truth" in flight else {}
+    summary["whiteness"] = whiteness_table(whiteness_series(solution))
+    summary["nees"] = nees_table(nees_series(solution, flight["truth"])) if "truth" in references else {}
     summary["health"] = _health(solution, flight)
+    summary["sensors"] = sensor_table(solution, flight) if scored else {}
+    summary["findings"] = findings(summary["sensors"])
     summary["warnings"] = facts["warnings"]
     summary["timings"] = facts["timings"]
     solution.summary = finite(summary)

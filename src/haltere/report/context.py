@@ -14,8 +14,9 @@ from haltere.flight.log import FlightLog, Stream
 from haltere.flight.solution import Solution
 from haltere.metrics.attitude import euler
 from haltere.report.series import Pool, breaks
+from haltere.report.style import MODES
 
-__all__ = ["COMPONENTS", "SENSORS", "Context", "Episode", "covered", "sensor_label"]
+__all__ = ["COMPONENTS", "SENSORS", "Context", "Episode", "Mode", "covered", "sensor_label"]
 
 FloatArray = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -58,6 +59,16 @@ class Episode:
     end: float
     n: int
     reasons: tuple[str, ...]
+
+
+@dataclass(frozen=True)
+class Mode:
+    """A stretch of one flight mode; ``armed`` is None where the log does not say."""
+
+    start: float
+    end: float
+    name: str
+    armed: bool | None
 
 
 @dataclass
@@ -103,6 +114,32 @@ class Context:
             if e["kind"] != "aligned"
         ]
         return [float(t) for t in times if t is not None][:40]
+
+    @cached_property
+    def modes(self) -> list[Mode]:
+        """Flight modes and arming over the time shown, as the log gives them; empty where it does not."""
+        stream = self.flight.get("modes")
+        if stream is None or len(stream) == 0:
+            return []
+        known = np.flatnonzero(np.isfinite(stream.t))
+        rows = known[np.argsort(stream.t[known], kind="stable")]
+        names = [str(m) for m in stream["mode"][rows]] if "mode" in stream else [""] * len(rows)
+        armed = [None if math.isnan(a) else bool(a > 0.5) for a in stream.get("armed")[rows]]
+        out: list[Mode] = []
+        for t, end, name, state in zip(stream.t[rows], [*stream.t[rows][1:], math.inf], names, armed, strict=True):
+            start, stop = max(float(t), self.span[0]), min(float(end), self.span[1])
+            if stop <= start:
+                continue
+            if out and (out[-1].name, out[-1].armed) == (name, state) and out[-1].end == start:
+                start = out.pop().start
+            out.append(Mode(start, stop, name, state))
+        return out
+
+    @cached_property
+    def mode_colours(self) -> dict[str, str]:
+        """Colour of each flight mode, in the order in which they were flown; the last serves all that remain."""
+        names = dict.fromkeys(m.name for m in self.modes if m.name)
+        return {name: f"mode{min(k, MODES - 1)}" for k, name in enumerate(names)}
 
     @cached_property
     def origin(self) -> tuple[float, float, float] | None:

@@ -52,6 +52,8 @@ def section_html(section: Section, figures: list[Figure]) -> str:
             out.append(f"<h3>{escape(figure['title'])}</h3>")
         name, height = f"figure-{escape(figure['name'])}", figure["height"]
         out.append(f'<div class="figure" id="{name}" data-figure="{len(figures)}" style="height:{height}px"></div>')
+        if "reading" in figure:
+            out.append(f'<p class="note">{escape(figure["reading"])}</p>')
         figures.append(figure)
     out.append(f"{section.after}</section>")
     return "\n".join(out)

@@ -11,14 +11,13 @@ from haltere.metrics.errors import reference_position
 from haltere.report.context import Context, covered, sensor_label
 from haltere.report.markup import Section
 from haltere.report.panels import FOOT, LEFT, TOP, pen, plain
-from haltere.report.series import display, thin
 from haltere.report.style import AXES, SENSOR_COLOURS
 
-__all__ = ["timeline", "track"]
+__all__ = ["fixes", "shades", "timeline", "track"]
 
 FloatArray = NDArray[np.float64]
-#: Fixes drawn as dots on the map at most.
-DOTS = 1200
+#: Opacity of the shade of a flight mode, and of what is not armed.
+SHADE, DISARMED = 0.12, 0.1
 
 
 def track(c: Context) -> Section:
@@ -33,42 +32,38 @@ def track(c: Context) -> Section:
     traces: list[dict[str, Any]] = []
     points: list[tuple[FloatArray, FloatArray]] = []
 
-    def add(label: str, colour: str, t: FloatArray, p: FloatArray, dots: bool) -> None:
+    def add(label: str, colour: str, t: FloatArray, p: FloatArray, dots: bool) -> list[int]:
+        ids = c.pool.series(t, list(p.T), [1e-3] * 3, even=True, weight=2.0)
+        if not ids:
+            return ids
         good = np.isfinite(p[:, :2]).all(axis=1)
-        if not good.any():
-            return
-        t, p = t[good], p[good]
-        if dots:
-            rows = thin([p[:, 0], p[:, 1]], DOTS)
-            shown = [t[rows], p[rows, 0], p[rows, 1], p[rows, 2]]
-        else:
-            shown = display(t, [p[:, 0], p[:, 1], p[:, 2]], 2 * c.pool.points)
-        ids = [c.pool.add(shown[0], 1e-4), *(c.pool.add(s) for s in shown[1:])]
-        points.append((p[:, 0], p[:, 1]))
+        points.append((p[good, 0], p[good, 1]))
         look = {"marker": {"size": 4, "color": f"@{colour}"}} if dots else {"line": pen(colour, 2.2 if colour == "estimate" else 1.2)}
         traces.append({
-            "type": "scatter", "name": label, "x": {"$a": ids[2]}, "y": {"$a": ids[1]}, "customdata": {"$zip": [ids[0], ids[3]]},
-            "mode": "markers" if dots else "lines", **look,
+            "type": "scatter", "name": label, "$track": {"ids": ids}, "mode": "markers" if dots else "lines", **look,
             "hovertemplate": "N %{y:.2f} m, E %{x:.2f} m, D %{customdata[1]:.2f} m<br>t = %{customdata[0]:.2f} s",
         })  # fmt: skip
+        return ids
 
-    components = [c.measured(f"pos_{a}") for a in "ned"]
-    if len(components[0][0]) and len({len(t) for t, _ in components}) == 1:
-        add("GNSS fixes", "gnss", components[0][0], np.column_stack([v for _, v in components]), True)
-    add("estimate", "estimate", c.solution.t, c.solution.vector("pos", "ned"), False)
+    add("GNSS fixes", "gnss", *fixes(c), True)
+    ids = add("estimate", "estimate", c.solution.t, c.solution.vector("pos", "ned"), False)
     for name, stream in c.references:
-        t, p = reference_position(stream, list(c.origin) if c.origin else None)
-        if len(t):
-            add(name, name, t, p, False)
+        add(name, name, *reference_position(stream, list(c.origin) if c.origin else None), False)
+    if ids:
+        window = {"color": "@event", "width": 5}
+        traces.append({"type": "scatter", "name": "time shown", "$track": {"ids": ids, "window": True}, "mode": "lines", "line": window,
+                       "opacity": 0.55, "hoverinfo": "skip"})  # fmt: skip
+    middle, half = _frame(points)
     ends = c.solution.vector("pos", "ned")[[0, -1]]
+    inwards = ["left" if east > middle[1] else "right" for east in ends[:, 1]]
     traces.append({
         "type": "scatter", "name": "start and end", "x": ends[:, 1].tolist(), "y": ends[:, 0].tolist(), "mode": "markers+text",
         "text": ["start", "end"],
-        "textposition": ["top right", "bottom right"], "textfont": {"color": "@text"}, "hoverinfo": "skip",
+        "textposition": [f"{v} {h}" for v, h in zip(("top", "bottom"), inwards, strict=True)],
+        "textfont": {"color": "@text"}, "hoverinfo": "skip",
         "marker": {"size": 10, "symbol": ["circle-open", "square-open"], "color": "@text", "line": {"width": 2}},
     })  # fmt: skip
     _mark_events(c, traces)
-    middle, half = _frame(points)
     axis = {**AXES, "zeroline": True, "nticks": 8}
     layout = {
         "margin": {"l": LEFT, "r": 12, "t": TOP, "b": FOOT}, "hovermode": "closest",
@@ -77,8 +72,17 @@ def track(c: Context) -> Section:
         "yaxis": {**axis, "title": {"text": "north [m]", "standoff": 6}, "range": [middle[0] - half, middle[0] + half], "scaleanchor": "x",
                   "constrain": "domain"},
     }  # fmt: skip
-    section.figures.append({"name": "map", "traces": traces, "layout": layout, "height": 470, "time": False})
+    figure = {"name": "map", "traces": traces, "layout": layout, "height": 430, "time": False}
+    section.figures.append(figure | ({"windowed": {"ids": ids}} if ids else {}))
     return section
+
+
+def fixes(c: Context) -> tuple[FloatArray, FloatArray]:
+    """Times and north, east, down [m] of the GNSS positions, (n,) and (n, 3)."""
+    components = [c.measured(f"pos_{a}") for a in "ned"]
+    if len({len(t) for t, _ in components}) > 1:
+        return np.empty(0), np.empty((0, 3))
+    return components[0][0], np.column_stack([v for _, v in components])
 
 
 def _frame(points: list[tuple[FloatArray, FloatArray]]) -> tuple[tuple[float, float], float]:
@@ -131,6 +135,7 @@ def timeline(c: Context) -> Section:
                 starts, ends = np.array([e.start for e in mine]), np.array([e.end for e in mine])
                 traces.append(_bars(c, labels.index(label), starts, ends, f"@{colour}", text, word, 7, word not in named))
                 named.add(word)
+    _modes(c, labels, traces)
     happened = [e for e in c.solution.events if e.get("t_onset") is not None]
     if happened:
         labels.append("events")
@@ -138,18 +143,67 @@ def timeline(c: Context) -> Section:
             "type": "scatter", "name": "event", "mode": "markers", "x": [float(e["t_onset"]) for e in happened],
             "y": [len(labels) - 1] * len(happened),
             "marker": {"symbol": "star", "size": 11, "color": "@event"}, "hovertemplate": "t = %{x:.2f} s: %{text}", "showlegend": False,
-            "text": [plain(f"{sensor_label(e['sensor'])}: {e['kind']}. {e.get('evidence') or ''}") for e in happened],
+            "text": (told := [plain(f"{sensor_label(e['sensor'])}: {e['kind']}. {e.get('evidence') or ''}") for e in happened]),
+            "rows": [(float(e["t_onset"]), float(e["t_onset"]), text) for e, text in zip(happened, told, strict=True)],
         })  # fmt: skip
     n = len(labels)
-    height = 26 * n + 16 + FOOT + TOP
+    height = 19 * n + 10 + FOOT + TOP
     layout = {
         "margin": {"l": LEFT, "r": 12, "t": TOP, "b": FOOT}, "hovermode": "closest",
         "xaxis": {**AXES, "range": list(c.span), "title": {"text": "t [s]", "standoff": 4}, "hoverformat": ".3f"},
         "yaxis": {**AXES, "range": [n - 0.4, -0.6], "tickvals": list(range(n)), "ticktext": [plain(x) for x in labels], "showgrid": False,
                   "automargin": True, "fixedrange": True, "ticks": ""},
     }  # fmt: skip
-    note = "When measurements were used (thick) and refused or de-weighted (inside); stars are events."
-    return Section("timeline", "Timeline", note, [{"name": "timeline", "traces": traces, "layout": layout, "height": height, "time": True}])
+    note = "Thick: used; inside: refused or de-weighted; stars: events"
+    note += "; shades, behind all plots: flight modes, grey while disarmed." if shades(c) else "."
+    rows = [row for trace in traces for row in trace.pop("rows", [])]
+    figure = {"name": "timeline", "traces": traces, "layout": layout, "height": height, "time": True,
+              "table": {"heads": ["from [s]", "to [s]", "what"], "rows": sorted(rows)}}  # fmt: skip
+    return Section("timeline", "Timeline", note, [figure])
+
+
+def _modes(c: Context, labels: list[str], traces: list[dict[str, Any]]) -> None:
+    """Rows of flight modes and of arming, named where there is room."""
+    named = [m for m in c.modes if m.name]
+    if named:
+        labels.append("mode")
+        row = len(labels) - 1
+        for name, colour in c.mode_colours.items():
+            mine = [m for m in named if m.name == name]
+            first, last = np.array([m.start for m in mine]), np.array([m.end for m in mine])
+            texts = [f"mode {plain(name)}: {m.start:.2f} to {m.end:.2f} s" for m in mine]
+            traces.append(_bars(c, row, first, last, f"@{colour}/0.5", texts, "mode", 15, False))
+        since, until, names = [m.start for m in named], [m.end for m in named], [plain(m.name) for m in named]
+        stretches = {"starts": since, "ends": until, "names": names, "row": row}
+        traces.append({
+            "type": "scatter", "name": "mode", "mode": "text", "$labels": stretches, "textfont": {"size": 11, "color": "@text"},
+            "hoverinfo": "skip", "showlegend": False,
+        })  # fmt: skip
+    armed = [m for m in c.modes if m.armed]
+    if any(m.armed is not None for m in c.modes):
+        labels.append("armed")
+        starts: FloatArray = np.array([m.start for m in armed])
+        ends: FloatArray = np.array([m.end for m in armed])
+        apart = np.flatnonzero(starts[1:] > ends[:-1]) + 1
+        if armed:
+            starts, ends = starts[np.r_[0, apart]], ends[np.r_[apart - 1, len(ends) - 1]]
+        rest = [m for m in c.modes if m.armed is False]
+        texts = [f"not armed: {m.start:.2f} to {m.end:.2f} s" for m in rest]
+        before, after = np.array([m.start for m in rest]), np.array([m.end for m in rest])
+        traces.append(_bars(c, len(labels) - 1, before, after, "@disarmed/0.35", texts, "not armed", 4, False))
+        texts = [f"armed: {a:.2f} to {b:.2f} s" for a, b in zip(starts, ends, strict=True)]
+        traces.append(_bars(c, len(labels) - 1, starts, ends, "@armed", texts, "armed", 12, False))
+
+
+def shades(c: Context) -> list[tuple[float, float, str]]:
+    """What is shaded behind every plot over time: each flight mode, and over it where the vehicle was not armed.
+
+    Nothing where neither changes: a shade of the whole plot would only make it harder to read.
+    """
+    if len({(m.name, m.armed) for m in c.modes}) < 2:
+        return []
+    modes = [(m.start, m.end, f"@{c.mode_colours[m.name]}/{SHADE}") for m in c.modes if m.name]
+    return [*modes, *((m.start, m.end, f"@disarmed/{DISARMED}") for m in c.modes if m.armed is False)]
 
 
 def _why(reasons: tuple[str, ...]) -> str:
@@ -166,7 +220,9 @@ def _bars(
     for a, b, words in zip(starts.tolist(), ends.tolist(), text, strict=True):
         x += [round(a, 4), round(max(b, a + least), 4), None]
         texts += [words, words, None]
+    rows = [(round(a, 4), round(b, 4), words) for a, b, words in zip(starts.tolist(), ends.tolist(), text, strict=True)]
     return {
+        "rows": rows,
         "type": "scatter", "name": label, "legendgroup": label, "showlegend": legend, "mode": "lines", "x": x, "y": [row] * len(x),
         "text": texts, "line": {"color": colour, "width": width}, "hovertemplate": "%{text}<extra></extra>",
     }  # fmt: skip

@@ -6,13 +6,18 @@ from haltere.flight.log import FlightLog
 from haltere.flight.solution import Solution
 from haltere.report import overview, sections, tables
 from haltere.report.context import Context
-from haltere.report.document import LIMIT, POINTS, document
+from haltere.report.document import document
+from haltere.report.health import health
 from haltere.report.markup import Section, escape, section_html
 from haltere.report.panels import Figure
 from haltere.report.series import Pool
+from haltere.report.view import view
 from haltere.report.words import facts, verdict
 
 __all__ = ["page"]
+
+#: Sentences of the verdict that a first screen has room for, with the first, which is folded.
+SENTENCES = 6
 
 
 def page(solution: Solution, flight: FlightLog, command: str | None = None) -> str:
@@ -32,40 +37,51 @@ def page(solution: Solution, flight: FlightLog, command: str | None = None) -> s
     str
         The text of ``report.html``, below 5 MB.
     """
-    text = ""
-    for points in POINTS:
-        text = _assemble(Context(solution, flight, Pool(points)), command)
-        if len(text.encode("utf-8")) <= LIMIT:
-            break
-    return text
-
-
-def _assemble(c: Context, command: str | None) -> str:
+    c = Context(solution, flight, Pool())
     timeline = overview.timeline(c)
     timeline.after = tables.events(c)
     parts = [
-        timeline, sections.attitude(c), sections.velocity(c), sections.position(c), sections.biases(c), sections.wind(c),
-        sections.errors(c), sections.innovations(c), tables.consistency(c), tables.data(c), tables.configuration(c, command),
+        timeline, sections.attitude(c), sections.velocity(c), sections.position(c), view(c), sections.biases(c), sections.wind(c),
+        sections.errors(c), sections.innovations(c), tables.consistency(c), health(c), tables.data(c), tables.configuration(c, command),
     ]  # fmt: skip
     shown = [s for s in parts if s is not None and (s.figures or s.note or s.after)]
     track = overview.track(c)
     figures: list[Figure] = []
-    body = [_header(c), _first(c, track, figures), *(section_html(s, figures) for s in shown)]
-    return document(c.flight.meta.name or "flight", body, [(s.key, s.title) for s in (track, *shown)], figures, c.pool)
+    body = [_first(c, track, figures), *(section_html(s, figures) for s in shown)]
+    links = [(s.key, s.title) for s in (track, *shown)]
+    return document(_name(c), body, links, figures, c.pool, span=c.span, shades=overview.shades(c))
 
 
-def _header(c: Context) -> str:
+def _name(c: Context) -> str:
+    return c.flight.meta.name or "flight"
+
+
+def _verdict(c: Context) -> str:
+    """The verdict; what does not fit a first screen is folded, and so is its first sentence, which says when the estimator ran."""
     said = verdict(c)
     words = {"good": "solution good", "doubtful": "solution doubtful", "bad": "solution bad"}[said.level]
-    sentences = "".join(f"<li>{escape(s)}</li>" for s in said.sentences)
+    shown, folded = said.sentences[1:SENTENCES], said.sentences[SENTENCES:] + said.sentences[:1]
     return (
-        f'<header>\n<h1>{escape(c.flight.meta.name or "flight")}</h1>\n<section class="verdict {said.level}" id="verdict">'
-        f'<p class="headline"><span class="badge">{words}</span> {escape(said.headline)}</p><ul>{sentences}</ul></section>\n</header>'
+        f'<header><h1>{escape(_name(c))}</h1>\n<section class="verdict {said.level}" id="verdict">'
+        f'<p class="headline"><span class="badge">{words}</span> {escape(said.headline)}</p>{_list(shown)}{_more(_list(folded))}'
+        "</section></header>"
     )
 
 
+def _list(sentences: list[str]) -> str:
+    return f"<ul>{''.join(f'<li>{escape(s)}</li>' for s in sentences)}</ul>" if sentences else ""
+
+
+def _more(html: str) -> str:
+    return f'<details class="more"><summary>more</summary>{html}</details>'
+
+
+def _facts(c: Context) -> str:
+    rows = "".join(f"<div><dt>{escape(name)}</dt><dd>{escape(value)}</dd></div>" for name, value in facts(c))
+    return f'<section id="facts"><h2>Flight</h2><dl>{rows}</dl></section>'
+
+
 def _first(c: Context, track: Section, figures: list[Figure]) -> str:
-    """Map and facts, side by side where there is room."""
-    rows = "".join(f"<tr><th>{escape(name)}</th><td>{escape(value)}</td></tr>" for name, value in facts(c))
-    flown = f'<section id="facts"><h2>Flight</h2><table class="facts">{rows}</table></section>'
-    return f'<div class="first">\n{flown}\n{section_html(track, figures)}\n</div>'
+    """Verdict and facts, and beside them the map where there is room."""
+    beside = ' class="first"' if track.figures else ""
+    return f"<div{beside}>\n<div>{_verdict(c)}\n{_facts(c)}</div>\n{section_html(track, figures)}\n</div>"

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from haltere.report.series import Pool, display
+from haltere.report.series import Pool, thin
 from haltere.report.style import AXES
 
 __all__ = ["FOOT", "LEFT", "TOP", "Figure", "Panels", "pen", "plain"]
@@ -17,6 +17,8 @@ __all__ = ["FOOT", "LEFT", "TOP", "Figure", "Panels", "pen", "plain"]
 FloatArray = NDArray[np.float64]
 Figure = dict[str, Any]
 
+#: Room for a line that is shown with its band, relative to others.
+BANDED = 3.0
 #: Pixels of one panel, between panels, below, left and above them; markers shown at most a series.
 ROW, GAP, FOOT, LEFT, TOP, MARKERS = 150, 14, 44, 74, 30, 300
 
@@ -58,8 +60,7 @@ class Panels:
         self._named: set[str] = set()
 
     def _axes(self, row: int) -> dict[str, str]:
-        number = "" if row == 0 else str(row + 1)
-        return {"xaxis": f"x{number}", "yaxis": f"y{number}"}
+        return {"xaxis": "x", "yaxis": "y" if row == 0 else f"y{row + 1}"}
 
     def _trace(self, row: int, label: str, legend: bool = True, **rest: Any) -> None:
         """One trace; the legend names each label once a figure."""
@@ -88,21 +89,24 @@ class Panels:
         period: float | None = None,
         width: float = 1.9,
         centred: bool = False,
+        slow: bool = False,
     ) -> None:
-        """A line, with its band of one standard deviation where ``sd`` is given: about the line, or about zero (``centred``)."""
+        """A line, with its band of one standard deviation where ``sd`` is given: about the line, or about zero (``centred``).
+
+        A ``slow`` quantity needs no more room in the page than others.
+        """
         columns = [y] if sd is None else [y, sd]
-        shown = display(t, columns, self.pool.points, period)
-        if len(shown[0]) == 0:
+        ids = self.pool.series(t, columns, [resolution] * len(columns), period, weight=1.0 if sd is None or centred or slow else BANDED)
+        if not ids:
             return
-        ids = [self.pool.add(shown[0], 1e-4), self.pool.add(shown[1], resolution)]
-        finite = shown[1][np.isfinite(shown[1])]
+        good = np.isfinite(y) & np.isfinite(t)
+        finite = y[good] if period is None else y[good] - period * np.floor(y[good] / period + 0.5)
         reach = 0.0
         if sd is not None:
-            ids.append(self.pool.add(shown[2], resolution))
-            known = shown[2][np.isfinite(shown[2])]
+            known = sd[good & np.isfinite(sd)]
             reach = 1.5 * float(np.median(known)) if len(known) else 0.0
             band: dict[str, Any] = {
-                "$band": {"t": ids[0], "y": None if centred else ids[1], "sd": ids[2]}, "mode": "lines", "fill": "toself",
+                "$band": {"t": ids[0], "y": None if centred else ids[1], "sd": ids[2], "line": ids[1]}, "mode": "lines", "fill": "toself",
                 "hoverinfo": "skip", "fillcolor": "@limit/0.3" if centred else f"@{colour}/0.22", "line": {"width": 0},
             }  # fmt: skip
             self._trace(row, "±1σ" if centred else f"{label} ±1σ", **band)
@@ -111,23 +115,30 @@ class Panels:
         few = len(finite) <= 60
         trace: dict[str, Any] = {
             "x": {"$a": ids[0]}, "y": {"$a": ids[1]}, "mode": "lines+markers" if few else "lines", "line": pen(colour, width),
+            "marker": {"size": 4, "color": f"@{colour}"},
             "hovertemplate": f"%{{y:.4~g}}{' ± %{customdata:.2~g}' if sd is not None else ''} {unit}",
         }  # fmt: skip
-        if few:
-            trace["marker"] = {"size": 4, "color": f"@{colour}"}
         if sd is not None:
             trace["customdata"] = {"$a": ids[2]}
         self._trace(row, label, **trace)
         self.drawn.add(row)
 
+    def multiples(self, row: int, label: str, factor: float, *, colour: str = "limit") -> None:
+        """Dotted lines at plus and minus a multiple of the standard deviation of the line drawn last."""
+        band = next((t["$band"] for t in reversed(self.traces) if "$band" in t), None)
+        if band is not None:
+            self._bounds(row, label, band["t"], band["sd"], factor, colour)
+
     def limits(self, row: int, label: str, t: FloatArray, bound: FloatArray, *, resolution: float = 1e-3, colour: str = "limit") -> None:
         """Dotted lines at plus and minus a bound."""
-        shown = display(t, [bound], self.pool.points // 2)
-        if len(shown[0]) == 0:
+        ids = self.pool.series(t, [bound], [resolution])
+        if not ids:
             return
-        x, b = self.pool.add(shown[0], 1e-4), self.pool.add(shown[1], resolution)
-        for sign in (1.0, -1.0):
-            self._trace(row, label, x={"$a": x}, y={"$b": b, "k": sign}, mode="lines", hoverinfo="skip",
+        self._bounds(row, label, ids[0], ids[1], 1.0, colour)
+
+    def _bounds(self, row: int, label: str, t: int, bound: int, factor: float, colour: str) -> None:
+        for sign in (factor, -factor):
+            self._trace(row, label, x={"$a": t}, y={"$b": bound, "k": sign}, mode="lines", hoverinfo="skip",
                         line={"color": f"@{colour}", "width": 1, "dash": "dot"})  # fmt: skip
 
     def markers(
@@ -146,8 +157,6 @@ class Panels:
         widen: bool = True,
     ) -> None:
         """Marked points, at most `MARKERS` of them with the extremes among them."""
-        from haltere.report.series import thin
-
         good = np.flatnonzero(np.isfinite(y) & np.isfinite(t))
         if len(good) == 0:
             return
@@ -180,13 +189,16 @@ class Panels:
         """The figure: name, traces, layout, height and that its x axis is time."""
         n = len(self.titles)
         inner = n * self.row + (n - 1) * GAP
-        layout: dict[str, Any] = {"shapes": self.shapes, "margin": {"l": LEFT, "r": 12, "t": TOP, "b": FOOT}}
+        layout: dict[str, Any] = {
+            "shapes": self.shapes, "margin": {"l": LEFT, "r": 12, "t": TOP, "b": FOOT}, "hoversubplots": "axis",
+            "xaxis": {**AXES, "anchor": "y" if n == 1 else f"y{n}", "range": list(self.span), "hoverformat": ".3f",
+                      "unifiedhovertitle": {"text": "t = %{x:.3f} s"}, "title": {"text": "t [s]", "standoff": 4}},
+        }  # fmt: skip
         for k, title in enumerate(self.titles):
             top = 1.0 - k * (self.row + GAP) / inner
-            number = "" if k == 0 else str(k + 1)
             low, high = self.extent[k]
             y: dict[str, Any] = {
-                **AXES, "domain": [max(0.0, top - self.row / inner), top], "anchor": f"x{number}", "nticks": 6,
+                **AXES, "domain": [max(0.0, top - self.row / inner), top], "anchor": "x", "nticks": 6,
                 "title": {"text": plain(title), "standoff": 6},
             }  # fmt: skip
             if low <= high:
@@ -194,17 +206,5 @@ class Panels:
                 y["range"] = [low - margin, high + margin]
                 if k in self.reversed:
                     y["range"].reverse()
-            x: dict[str, Any] = {
-                **AXES,
-                "anchor": f"y{number}",
-                "range": list(self.span),
-                "hoverformat": ".3f",
-                "unifiedhovertitle": {"text": "t = %{x:.3f} s"},
-                "showticklabels": k == n - 1,
-            }
-            if k:
-                x["matches"] = "x"
-            if k == n - 1:
-                x["title"] = {"text": "t [s]", "standoff": 4}
-            layout[f"yaxis{number}"], layout[f"xaxis{number}"] = y, x
+            layout["yaxis" if k == 0 else f"yaxis{k + 1}"] = y
         return {"name": self.name, "traces": self.traces, "layout": layout, "height": self.height, "time": True}

@@ -15,7 +15,7 @@ from haltere.report.markup import Section
 from haltere.report.panels import Panels
 from haltere.report.style import SENSOR_COLOURS
 
-__all__ = ["attitude", "biases", "errors", "innovations", "position", "velocity", "wind"]
+__all__ = ["DEG", "angle_columns", "attitude", "biases", "errors", "innovations", "position", "velocity", "wind"]
 
 FloatArray = NDArray[np.float64]
 DEG = 180.0 / math.pi
@@ -32,12 +32,21 @@ def _sd(c: Context, name: str, factor: float = 1.0) -> FloatArray | None:
     return factor * c.solution[name] if name in c.solution else None
 
 
+def angle_columns(c: Context, k: int) -> tuple[FloatArray, list[FloatArray], list[float], float | None]:
+    """Times, angle and 1σ [deg], resolutions and period of roll, pitch or yaw (0, 1, 2), as `Pool.series` takes them."""
+    columns = [c.angles[:, k]]
+    sd = _sd(c, f"sd_{('roll', 'pitch', 'yaw')[k]}", DEG)
+    if sd is not None:
+        columns.append(sd)
+    return c.solution.t, columns, [1e-3] * len(columns), None if k == 1 else 360.0
+
+
 def attitude(c: Context) -> Section:
     """Roll, pitch and yaw with 1σ, over truth and onboard."""
     panels = _panels(c, "attitude", ["roll [deg]", "pitch [deg]", "yaw [deg]"])
-    for k, angle in enumerate(("roll", "pitch", "yaw")):
-        period = None if angle == "pitch" else 360.0
-        panels.line(k, "estimate", "estimate", c.solution.t, c.angles[:, k], _sd(c, f"sd_{angle}", DEG), unit="deg", period=period)
+    for k in range(3):
+        t, columns, _, period = angle_columns(c, k)
+        panels.line(k, "estimate", "estimate", t, *columns, unit="deg", period=period)
         for name, stream in c.references:
             q = stream.vector("q", "wxyz")
             good = np.isfinite(q).all(axis=1)
@@ -106,7 +115,7 @@ def biases(c: Context) -> Section | None:
     panels = _panels(c, "biases", [g[1] for g in groups], 112)
     for k, (name, _, unit, factor, resolution) in enumerate(groups):
         y = factor * c.solution[name]
-        panels.line(k, "estimate", "estimate", c.solution.t, y, _sd(c, f"sd_{name}", factor), unit=unit, resolution=resolution)
+        panels.line(k, "estimate", "estimate", c.solution.t, y, _sd(c, f"sd_{name}", factor), unit=unit, resolution=resolution, slow=True)
         for label, stream in c.references:
             panels.line(k, label, label, stream.t, factor * stream.get(name), unit=unit, resolution=resolution, width=1.0)
     return Section("biases", "Sensor biases", "Measured minus true; the estimate is subtracted from the sensor.", [panels.figure()])
@@ -147,7 +156,7 @@ def errors(c: Context) -> Section | None:
             at = None if sd is None else np.interp(t, c.solution.t, sd)
             panels.line(k, "estimate less truth", "estimate", t, factor * e, at, unit=unit, centred=True)
             if at is not None:
-                panels.limits(k, "±3σ", t, 3.0 * at)
+                panels.multiples(k, "±3σ", 3.0)
         figures.append({**panels.figure(), "title": title})
     note = "The band is what the filter states: the error should lie inside for two thirds of the time, and nearly always between the dots."
     return Section("errors", "Errors against truth", note, figures)
@@ -192,7 +201,7 @@ def _innovation(c: Context, panels: Panels, row: int, sensor: str, component: st
     panels.line(
         row, "innovation", SENSOR_COLOURS.get(sensor, "assumed"), t, e, sd, unit=unit, resolution=resolution, width=1.0, centred=True
     )
-    panels.limits(row, label, t, gate * sd, resolution=resolution)
+    panels.multiples(row, label, gate)
     bound = 1.1 * gate * float(np.median(sd))
     passed = np.abs(e[status != "rejected"])
     refused = np.abs(e[status == "rejected"])

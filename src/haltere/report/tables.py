@@ -7,6 +7,7 @@ from typing import Any
 
 from haltere.flight.config import KEYS, Value, defaults
 from haltere.flight.schema import base_name
+from haltere.report.consistency import consistency_figures
 from haltere.report.context import Context, sensor_label
 from haltere.report.markup import Section, escape, table
 from haltere.report.words import count, discarded, episode_in_words, nis_in_words, number
@@ -17,7 +18,9 @@ __all__ = ["configuration", "consistency", "data", "errors_table", "events"]
 ROWS = 40
 
 
-_UNITS = {"gyro_bias": ("deg/s", 180.0 / math.pi), "accel_bias": ("m/s²", 1.0), "vel": ("m/s", 1.0), "pos": ("m", 1.0)}
+_UNITS = {
+    "gyro_bias": ("deg/s", 180.0 / math.pi), "accel_bias": ("m/s²", 1.0), "vel": ("m/s", 1.0), "pos": ("m", 1.0), "wind": ("m/s", 1.0),
+}  # fmt: skip
 
 
 def errors_table(c: Context) -> str:
@@ -40,7 +43,7 @@ def errors_table(c: Context) -> str:
 def consistency(c: Context) -> Section:
     """NIS and NEES against their χ² bands, in a table and in words."""
     summary = c.solution.summary
-    section = Section("consistency", "Is the stated uncertainty true?")
+    section = Section("consistency", "Is the stated uncertainty true?", figures=consistency_figures(c))
     nis = summary.get("nis", {})
     rows: list[tuple[str, ...]] = [
         (
@@ -62,7 +65,7 @@ def consistency(c: Context) -> Section:
     elif nis:
         section.after += "<p>No NEES: it needs a truth, and this flight has none.</p>"
     section.after += errors_table(c)
-    if not section.after:
+    if not section.after and not section.figures:
         section.note = "Nothing to say: no measurement was offered to the filter, and there is nothing to compare with."
     return section
 
@@ -87,6 +90,7 @@ def data(c: Context) -> Section:
         mean = (facts["n"] - 1) / length if length > 0.0 else None
         compared = base_name(name) in ("onboard", "truth")
         note = "compared with, never read by the estimator" if compared else "" if base_name(name) == name else "further unit, not used"
+        gap = facts.get("longest_gap")
         rows.append(
             (
                 escape(name),
@@ -94,10 +98,13 @@ def data(c: Context) -> Section:
                 "–" if compared else number(facts["rate"]),
                 number(mean),
                 "–" if compared else f"{facts['gaps']}",
+                number(gap),
+                "–" if gap is None else f"{facts['longest_gap_at']:.2f}",
                 note,
             )
         )
-    section.after += table(("stream", "samples", "rate [Hz]", "mean [Hz]", "gaps", "note "), rows, caption="streams of the log")
+    heads = ("stream", "samples", "rate [Hz]", "mean [Hz]", "gaps", "longest interval [s]", "from t [s]", "note ")
+    section.after += table(heads, rows, caption="streams of the log")
     return section
 
 

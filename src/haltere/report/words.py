@@ -9,11 +9,15 @@ from typing import Any
 import numpy as np
 
 from haltere.flight.log import FlightLog
+from haltere.flight.schema import base_name
 from haltere.flight.solution import Solution
 from haltere.report.context import Context, Episode, sensor_label
 from haltere.report.series import Pool
 
-__all__ = ["Verdict", "count", "discarded", "facts", "nis_in_words", "number", "verdict", "verdict_of"]
+__all__ = [
+    "Verdict", "count", "discarded", "facts", "fixed", "nis_in_words", "number", "verdict", "verdict_of",
+    "whiteness_in_words",
+]  # fmt: skip
 
 #: Share of a stream's samples above which a discard is worth a word in the verdict.
 WORTH_TELLING = 0.01
@@ -73,7 +77,9 @@ def verdict(c: Context) -> Verdict:
     lost = [d for d in discarded(summary) if d[2] > 0.05 * max(d[3], 1) and d[1] not in ("before alignment", "no 3-D fix")]
     drifting = "pos_n" in solution and not c.held_by_measurement
     torn = [e for e in solution.events if e["kind"] == "gap" and (e.get("statistic") or 0.0) > 1.0]
-    worst = 2 if by_level["bad"] or broken else 1 if by_level["doubtful"] or lost or drifting or torn else 0
+    found = summary.get("findings", [])
+    ill = list(dict.fromkeys(_unit_label(f) for f in found if base_name(f["stream"]) == f["stream"]))  # further units are not used
+    worst = 2 if by_level["bad"] or broken else 1 if by_level["doubtful"] or lost or drifting or torn or ill else 0
     if broken:
         headline = f"The filter broke down {count(len(broken), 'time')}: read what follows with that in mind."
     elif by_level["bad"] or by_level["doubtful"]:
@@ -84,6 +90,9 @@ def verdict(c: Context) -> Verdict:
     elif torn:
         seconds = sum(float(e["statistic"]) for e in torn)
         headline = f"The sensors agree, but the solution is interrupted: {seconds:.0f} s are without IMU samples."
+    elif ill:
+        agree = "The sensors agree with each other, but" if len(by_level["good"]) > 1 else "Mind that"
+        headline = f"{agree} the {_list(ill)} {'are' if len(ill) > 1 else 'is'} not in good health."
     elif worst:
         headline = "The sensors agree, but a good part of the data could not be used."
     elif len(by_level["good"]) > 1:
@@ -94,7 +103,8 @@ def verdict(c: Context) -> Verdict:
         headline = "Nothing but the inertial sensors was used, so nothing confirms the solution."
         worst = 1
     out = Verdict(("good", "doubtful", "bad")[worst], headline)
-    out.sentences += [_coverage(c), *_health(by_level, health), *_what_happened(c), *_quality(c), *_left_out(summary)]
+    out.sentences += [_coverage(c), *_health(by_level, health), *(_finding_in_words(f) for f in found)]
+    out.sentences += [*_what_happened(c), *_quality(c), *_left_out(summary)]
     return out
 
 
@@ -117,6 +127,51 @@ def _health(by_level: dict[str, list[str]], health: dict[str, Any]) -> list[str]
         for word in ("bad", "doubtful")
         for s in by_level[word]
     ]
+
+
+def _unit_label(finding: dict[str, Any]) -> str:
+    """What a reader calls the sensor of a finding."""
+    stream, what = finding["stream"], finding["what"]
+    if base_name(stream) == "imu":
+        named = "gyro" if what.startswith("gyro") or str(finding.get("axis", "")).startswith("gyro") else "accelerometer"
+        return named if stream == "imu" else f"{named} of {stream}"
+    return sensor_label(stream)
+
+
+def _span_of(finding: dict[str, Any]) -> str:
+    first, last = finding.get("first"), finding.get("last")
+    if first is None or last is None:
+        return ""
+    return f" at t = {first:.1f} s" if last - first < 0.05 else f" between t = {first:.1f} and {last:.1f} s"
+
+
+def _finding_in_words(f: dict[str, Any]) -> str:
+    """One finding about a sensor as a sentence; the limits are those of `haltere.metrics.sensors.FINDINGS`."""
+    what, value, unit = f["what"], float(f["value"]), _unit_label(f)
+    start = f"{unit[:1].upper()}{unit[1:]}"
+    if what in ("vibration", "px4_vibration"):
+        whose = "ArduPilot's measure (up to 30 is acceptable)" if what == "vibration" else "PX4's measure (above 9.81 is too high)"
+        return f"Vibration is high: {fixed(value)} m/s² by {whose} in a twentieth of the time. It can clip the {unit}, or fold into it."
+    if what in ("clips", "clipped_samples", "gyro_clipped_samples"):
+        return f"{start}: {count(round(value), 'sample')} at the end of its range{_span_of(f)}; what lies beyond was not measured."
+    if what == "frozen":
+        axis = f" {str(f['axis'])[-1]}" if str(f["axis"])[-2:-1] == "_" else ""
+        return f"{start}{axis} did not change for {value:.1f} s from t = {f['at']:.1f} s: frozen, or no sample was taken."
+    if what == "field":
+        parts = [f"{k} in {100.0 * f[k]:.0f} %" for k in ("strength", "dip") if (f.get(k) or 0.0) > f["limit"]]
+        return f"The magnetic field is far from what is expected here: {' and '.join(parts)} of the samples beyond the filter's tolerance."
+    if what == "field_load":
+        return f"The magnetic field follows the {f['load']}: {f['change']:+.1f} µT over its range, {100.0 * value:.0f} % of the field."
+    if what == "num_sats":
+        return f"GNSS used few satellites: {value:.0f} in the median."
+    if what in _ACCURACIES:
+        word, accuracy_unit = _ACCURACIES[what]
+        return f"GNSS accuracy is poor: {word} {fixed(value)} {accuracy_unit} in the median, by the receiver's own account."
+    shown = f"{math.degrees(value):.1f} deg/s" if what == "gyro_difference" else f"{value:.1f} m/s²"
+    return f"{start} differs from the first one by up to {shown} (t = {f['at']:.0f} s); only the first was used."
+
+
+_ACCURACIES = {"h_acc": ("horizontal", "m"), "v_acc": ("vertical", "m"), "s_acc": ("speed", "m/s")}
 
 
 def episode_in_words(e: Episode) -> str:
@@ -209,6 +264,20 @@ def nis_in_words(sensor: str, mean: float | None, band: list[float]) -> str:
     if mean < band[0]:
         return "innovations smaller than stated: noise set high, which is cautious" if mean < 0.67 else "slightly smaller than stated"
     return "as stated"
+
+
+def whiteness_in_words(components: dict[str, dict[str, Any]]) -> str:
+    """What the whiteness of a sensor's components says of the filter or the sensor."""
+    ill = {k: w for k, w in components.items() if w["verdict"] == "correlated"}
+    if not ill:
+        small = any(w["verdict"] == "nearly white" for w in components.values())
+        return "white but for a trace" if small else "white, as it should be"
+    longest = max(ill.values(), key=lambda w: w["lasting"])
+    if all(w["lag1"] < -w["limit1"] for w in ill.values()):
+        return "alternating: the filter follows the sensor's noise, its noise is set too low"
+    if longest["lag1"] > 0.5:
+        return f"lasting up to {fixed(longest['lasting'])} s: the sensor's errors last, or its noise is set too high"
+    return "weakly correlated: not all of the motion or the sensor's errors is modelled"
 
 
 def facts(c: Context) -> list[tuple[str, str]]:
