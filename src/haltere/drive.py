@@ -16,17 +16,18 @@ from haltere.aids.record import AID_RECORD, COMPONENTS, EVENTS, N_QUEUED, REASON
 from haltere.errors import HaltereError, UsageError
 from haltere.estimators import step as kernels
 from haltere.estimators.base import InitialState, new_state
-from haltere.estimators.inputs import Measurements, configure, imu_arrays, measurements, parameters
+from haltere.estimators.inputs import Measurements, configure, imu_arrays, measurements, parameters, request
 from haltere.estimators.registry import SPECIFICATIONS
 from haltere.flight.config import Config
-from haltere.flight.door import Checked, check
+from haltere.flight.corrections import correct
+from haltere.flight.door import Checked, check, fit
 from haltere.flight.local import geodetic_from_local
 from haltere.flight.log import FlightLog
 from haltere.flight.solution import Solution
 from haltere.metrics.summary import summarise
 from haltere.strapdown.layout import IMU_CAPACITY
 
-__all__ = ["run"]
+__all__ = ["run", "usable"]
 
 FloatArray = NDArray[np.float64]
 #: IMU samples between two looks at progress, and room for aid records between two drains.
@@ -45,6 +46,7 @@ def run(
     rate: float | None = None,
     initial: InitialState | None = None,
     progress: Callable[[float], None] | None = None,
+    scored: bool = True,
 ) -> Solution:
     """Run an estimator over a flight.
 
@@ -73,6 +75,8 @@ def run(
         State to begin from instead of aligning.
     progress
         Called with the fraction done, between chunks.
+    scored
+        Whether the summary holds errors, NEES and the tables of sensors too; without them for who scores many runs otherwise.
 
     Returns
     -------
@@ -93,9 +97,11 @@ def run(
     if rate is not None and not (math.isfinite(rate) and rate > 0.0):
         raise UsageError("a positive number of rows a second", repr(rate), "--rate")
     began = time.perf_counter()
+    asked = request(flight, estimator, preset, config, set)
+    flight = correct(flight, asked.values)
     blind = flight.without("onboard", "truth")
-    checked = check(blind, upright=estimator != "ahrs")
-    resolved = configure(blind, checked, estimator, preset, config, set)
+    checked = check(blind, upright=estimator != "ahrs", given=asked.values)
+    resolved = configure(blind, checked, estimator, preset, asked)
     specification = SPECIFICATIONS[estimator]
     t, gyro, accel = imu_arrays(blind, checked)
     offered = measurements(blind, checked, resolved)
@@ -118,8 +124,17 @@ def run(
         keep = _decimate(table["t"], rate)
         table = {name: column[keep] for name, column in table.items()}
     solution = Solution(table, _aid_table(aids_parts), events, resolved, {}, _covariance(cov, int(S["n_cov"][0])))
-    summarise(solution, flight, _facts(flight, checked, S, offered, n, t, began, prepared, filtered))
+    shown = fit(flight, checked)
+    summarise(solution, shown, _facts(flight, checked, S, offered, n, t, began, prepared, filtered), scored)
+    for name, stream in flight.streams.items():  # as read, before anything was left out
+        solution.summary["streams"][name]["n"] = len(stream)
     return solution
+
+
+def usable(flight: FlightLog, config: Config) -> FlightLog:
+    """A flight as a run with this configuration took it: corrected, in order and without what cannot be used; for what shows a run."""
+    flight = correct(flight, config.values)
+    return fit(flight, check(flight.without("onboard", "truth"), upright=config.estimator != "ahrs", given=config.values))
 
 
 def _loop(

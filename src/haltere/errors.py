@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-__all__ = ["HaltereError", "UsageError"]
+from collections.abc import Iterable
+
+__all__ = ["HaltereError", "UsageError", "nearest"]
 
 
 class HaltereError(ValueError):
@@ -34,3 +36,12 @@ class UsageError(HaltereError):
     """A wrong option, key, name or preset: the command line exits with 2."""
 
     exit_status = 2
+
+
+def nearest(name: str, names: Iterable[str]) -> str:
+    """``did you mean ...?`` with the nearest of some names, whatever their case; empty where none is near."""
+    import difflib
+
+    by_folded = {n.casefold(): n for n in names}
+    near = difflib.get_close_matches(name.casefold(), by_folded, 1)
+    return f"did you mean {by_folded[near[0]]!r}?" if near else ""

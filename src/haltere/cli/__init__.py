@@ -25,6 +25,16 @@ app = typer.Typer(
 )
 
 Log = Annotated[Path, typer.Argument(metavar="LOG", help="A log of any supported format, or a flight folder.", show_default=False)]
+Columns = Annotated[
+    Path | None,
+    typer.Option("--columns", metavar="F", help='Column map of a single table: TOML, "imu.gyro_x" = "gx [deg/s]".', show_default=False),
+]
+Column = Annotated[
+    list[str] | None,
+    typer.Option(
+        "--column", metavar="COL=SOURCE", help="One column of the map, imu.gyro_x='gx [deg/s]'. May be repeated.", show_default=False
+    ),
+]
 Json = Annotated[bool, typer.Option("--json", help="Print the summary as JSON to stdout, and nothing else.")]
 Open = Annotated[bool, typer.Option("--open", help="Show the report in the browser afterwards.")]
 
@@ -72,6 +82,8 @@ def _run(
         float | None,
         typer.Option("--rate", metavar="HZ", help="Rows a second of the solution. Default: every IMU sample.", show_default=False),
     ] = None,
+    columns: Columns = None,
+    column: Column = None,
     json: Json = False,
     open_: Open = False,
 ) -> None:
@@ -79,7 +91,7 @@ def _run(
 
     run(
         log, estimator=estimator, preset=preset, config=config, assignments=set_ or [], smooth=smooth, vehicle=vehicle, out=out, rate=rate,
-        json=json, show=open_,
+        columns=columns, column=column, json=json, show=open_,
     )  # fmt: skip
 
 
@@ -104,10 +116,88 @@ def _demo(
     short_help="What a log holds and supports.",
     help="Say what is in a log, what each estimator can do with it, and which logging setting would help.",
 )
-def _info(log: Log, json: Json = False) -> None:
+def _info(log: Log, columns: Columns = None, column: Column = None, json: Json = False) -> None:
     from haltere.cli.info import info
 
-    info(log, json=json)
+    info(log, json=json, columns=columns, column=column)
+
+
+@app.command(
+    "compare",
+    short_help="A log through several estimators and peers.",
+    help="Run a log through several estimators, installed peers (vqf, imufusion, ahrs) and the onboard solution; score all alike, against "
+    "truth or onboard; write one table and one page.",
+)
+def _compare(
+    log: Log,
+    estimators: Annotated[
+        str,
+        typer.Option("--estimators", metavar="A,B,...", help="Of ours, each NAME[@PRESET][:KEY=VALUE]..., e.g. navigator:gate.gnss=3"),
+    ] = "navigator,ahrs",
+    peers: Annotated[str, typer.Option("--peers", metavar="P,Q,...", help="all that are installed, none, or names like vqf.VQF")] = "all",
+    against: Annotated[
+        str | None,
+        typer.Option("--against", metavar="REF", help="truth or onboard. Default: truth, if there, else onboard.", show_default=False),
+    ] = None,
+    set_: Annotated[
+        list[str] | None,
+        typer.Option("--set", metavar="KEY=VALUE", help="One configuration key, for all of ours. May be repeated.", show_default=False),
+    ] = None,
+    settle: Annotated[float, typer.Option("--settle", metavar="S", help="Seconds after the slowest start before scoring.")] = 5.0,
+    out: Annotated[
+        Path | None, typer.Option("--out", metavar="DIR", help="Folder to write. Default: ./<log>.haltere-compare", show_default=False)
+    ] = None,
+    json: Json = False,
+    open_: Open = False,
+) -> None:
+    from haltere.cli.compare import compare
+
+    compare(log, estimators=estimators, peers=peers, against=against, assignments=set_ or [], settle=settle, out=out, json=json, show=open_)
+
+
+@app.command(
+    "simulate",
+    short_help="A simulated flight with truth.",
+    help="Simulate a flight and write it as a flight folder with truth. SCENARIO is a built-in name (hover, climb, box, figure-eight, "
+    "lissajous, identify, tour, demo, gusty, real-parts) or a TOML file.",
+)
+def _simulate(
+    scenario: Annotated[str, typer.Argument(metavar="SCENARIO", help="Name or TOML file.", show_default=False)],
+    out: Annotated[Path, typer.Option("--out", metavar="DIR", help="The folder to write.", show_default=False)],
+    set_: Annotated[
+        list[str] | None,
+        typer.Option("--set", metavar="KEY=VALUE", help="Change one key, e.g. wind.n=6 or seed=3. May be repeated.", show_default=False),
+    ] = None,
+    fault: Annotated[
+        list[str] | None,
+        typer.Option("--fault", metavar="WORD", help="A fault, e.g. gyro.x:bias=3deg/s@60. May be repeated.", show_default=False),
+    ] = None,
+    json: Json = False,
+) -> None:
+    from haltere.cli.simulate import simulate
+
+    simulate(scenario, out, assignments=set_ or [], faults=fault or [], json=json)
+
+
+@app.command(
+    "inject",
+    short_help="Put faults into a flight.",
+    help="Put faults into a real or simulated flight, exact in time and size, and write it as a flight folder that names them.",
+)
+def _inject(
+    log: Log,
+    faults: Annotated[
+        list[str],
+        typer.Argument(
+            metavar="FAULT...", help="SENSOR[.UNIT][.AXIS]:KIND[=SIZE]@START[-END], e.g. gnss:dropout@100-130", show_default=False
+        ),
+    ],
+    out: Annotated[Path, typer.Option("--out", metavar="DIR", help="The folder to write.", show_default=False)],
+    json: Json = False,
+) -> None:
+    from haltere.cli.inject import inject
+
+    inject(log, faults, out, json=json)
 
 
 @app.command(
@@ -117,11 +207,13 @@ def _convert(
     log: Log,
     out: Annotated[Path, typer.Argument(metavar="DIR", help="The folder to write.", show_default=False)],
     csv: Annotated[bool, typer.Option("--csv", help="Tables as CSV instead of Parquet.")] = False,
+    columns: Columns = None,
+    column: Column = None,
     json: Json = False,
 ) -> None:
     from haltere.cli.convert import convert
 
-    convert(log, out, csv=csv, json=json)
+    convert(log, out, csv=csv, json=json, columns=columns, column=column)
 
 
 def main() -> None:

@@ -9,7 +9,9 @@ from pathlib import Path
 __all__ = ["convert"]
 
 
-def convert(log: Path, out: Path, csv: bool = False, json: bool = False) -> None:
+def convert(
+    log: Path, out: Path, csv: bool = False, json: bool = False, columns: Path | None = None, column: list[str] | None = None
+) -> None:
     """Write a log as a flight folder.
 
     Parameters
@@ -22,17 +24,20 @@ def convert(log: Path, out: Path, csv: bool = False, json: bool = False) -> None
         Tables as CSV instead of Parquet.
     json
         Print only the summary, as JSON.
+    columns, column
+        Column map of a single table: a file, and single columns.
 
     Raises
     ------
     HaltereError
         The log cannot be read, or the folder not be written.
     """
+    from haltere.cli.columns import column_map
     from haltere.cli.info import summary
     from haltere.flight.folder import write_folder
     from haltere.readers import read
 
-    flight = read(log)
+    flight = read(log, column_map(columns, column))
     folder = write_folder(flight, out, csv=csv)
     for name, reasons in flight.discarded.items():
         for reason, n in reasons.items():

@@ -1,4 +1,4 @@
-"""`haltere demo`: a simulated flight through the navigator, with its report; no input, no network. It simulates nothing itself."""
+"""`haltere demo`: a simulated flight with two faults through the navigator, with its report; no input, no network."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ __all__ = ["demo"]
 
 
 def demo(out: Path, *, seed: int = 1, json: bool = False, show: bool = False) -> None:
-    """Simulate a flight, navigate it, write its folder.
+    """Simulate a flight in gusty wind, with a disturbed field and a gyro that fails, navigate it, write its folder.
 
     Parameters
     ----------
@@ -27,10 +27,11 @@ def demo(out: Path, *, seed: int = 1, json: bool = False, show: bool = False) ->
     from haltere.cli.run import finish, told
 
     with Progress() as progress:
-        progress.stage("simulating a flight")
-        from haltere.simulate import demo_flight
+        progress.stage("simulating a flight", compiles=True)
+        from haltere.simulate import SCENARIOS
+        from haltere.simulate import simulate as fly
 
-        flight = demo_flight(seed=seed)
+        flight = fly(SCENARIOS["demo"].changed(seed=seed))
         progress.stage("navigator", compiles=True)
         from haltere import drive
 

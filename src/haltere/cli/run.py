@@ -7,6 +7,7 @@ import shlex
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from haltere.cli.columns import column_map
 from haltere.cli.progress import Progress
 
 if TYPE_CHECKING:
@@ -34,6 +35,8 @@ def run(
     vehicle: Path | None = None,
     out: Path | None = None,
     rate: float | None = None,
+    columns: Path | None = None,
+    column: list[str] | None = None,
     json: bool = False,
     show: bool = False,
 ) -> None:
@@ -56,6 +59,8 @@ def run(
         As of `haltere.run`.
     out
         Folder to write; default `default_folder`.
+    columns, column
+        Column map of a single table: a file, and single columns; see `haltere.cli.columns`.
     json
         Print only the summary, as JSON.
     show
@@ -81,12 +86,13 @@ def run(
     configuration.resolve(estimator, preset, keys, str(config))
     configuration.resolve(estimator, preset, changes, "--set")
 
+    mapped = column_map(columns, column)
     folder = Path(out) if out is not None else default_folder(log)
     with Progress() as progress:
         progress.stage("reading the log")
         from haltere.readers import read
 
-        flight = read(log)
+        flight = read(log, mapped)
         progress.stage(estimator, compiles=True)
         from haltere import drive
 
@@ -100,7 +106,10 @@ def run(
             "--config",
             str(folder / "config.toml"),
             *(["--rate", f"{rate:g}"] if rate is not None else []),
+            *(["--columns", str(columns)] if columns is not None else []),
+            *(word for text in column or [] for word in ("--column", text)),
         ]
+        flight = drive.usable(flight, solution.config)
         finish(solution, flight, folder, shlex.join(again), progress)
     told(solution, flight, folder, json=json, show=show)
 

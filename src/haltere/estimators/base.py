@@ -18,6 +18,9 @@ from haltere.estimators import step as kernels
 from haltere.estimators.inputs import altitude_of, parameters
 from haltere.flight import config as configuration
 from haltere.flight.config import Config
+from haltere.flight.door import impossible_place, impossible_pressure
+from haltere.flight.names import nearest_column, nearest_stream
+from haltere.flight.schema import column as schema_column
 from haltere.strapdown.layout import CORE, layout
 
 __all__ = ["Estimator", "InitialState", "State", "new_state"]
@@ -25,6 +28,12 @@ __all__ = ["Estimator", "InitialState", "State", "new_state"]
 FloatArray = NDArray[np.float64]
 _NO_ROWS = np.empty((0, 0))
 _NAN = (math.nan, math.nan, math.nan)
+_VALUES = {
+    "gnss": ("lat", "lon", "alt", "vel_n", "vel_e", "vel_d"),
+    "barometer": ("pressure",),
+    "magnetometer": ("mag_x", "mag_y", "mag_z"),
+}
+_ACCURACIES = ("h_acc", "h_acc", "v_acc", "s_acc", "s_acc", "s_acc")
 
 
 @dataclass(frozen=True)
@@ -131,14 +140,11 @@ def _begin_from(record: NDArray[np.void], initial: InitialState) -> None:
         raise HaltereError(f"an initial covariance of shape ({n}, {n})", f"{P.shape}", "initial state", "see State.P for the order")
     if not np.allclose(P, P.T, rtol=1e-9, atol=1e-15) or np.linalg.eigvalsh(P).min() <= 0.0:
         raise HaltereError("a symmetric positive covariance", "one that is not", "initial state")
-    record["t"] = initial.t
-    for name, values in (
-        ("q", initial.q_nb),
-        ("v", initial.vel_n),
-        ("p", initial.pos_n),
-        ("bg", initial.gyro_bias_b),
-        ("ba", initial.accel_bias_b),
-    ):
+    record["t"] = _number(initial.t, "t", "initial state")
+    for name, field, size in (("q", "q_nb", 4), ("v", "vel_n", 3), ("p", "pos_n", 3), ("bg", "gyro_bias_b", 3), ("ba", "accel_bias_b", 3)):
+        values = np.asarray(getattr(initial, field), dtype=np.float64)
+        if values.shape != (size,) or not np.isfinite(values).all() or (name == "q" and not values.any()):
+            raise HaltereError(f"{size} finite numbers for {field}", f"{values.tolist()}", "initial state")
         record[name][0] = values
     record["baro_start"] = initial.baro_bias
     if n > CORE:
@@ -189,6 +195,7 @@ class Estimator:
         self._aids = as_records(np.empty(4096, AID_RECORD))
         self._now = np.zeros(11)
         self._view = State(self._S)
+        self._refused: dict[str, dict[str, int]] = {}
 
     def step(self, t: float, gyro: Sequence[float], accel: Sequence[float]) -> State:
         """Take one IMU sample.
@@ -204,9 +211,14 @@ class Estimator:
         -------
         State
             Live view of the state at the fusion horizon. Use ``state`` for a copy that stays.
+
+        Raises
+        ------
+        UsageError
+            Not three numbers each.
         """
         kernels.step(
-            self._S, self._prm, t, (float(gyro[0]), float(gyro[1]), float(gyro[2])), (float(accel[0]), float(accel[1]), float(accel[2])),
+            self._S, self._prm, _number(t, "t", "Estimator.step"), _three(gyro, "gyro"), _three(accel, "accel"),
             _NO_ROWS, _NO_ROWS, self._aids,
         )  # fmt: skip
         return self._view
@@ -224,48 +236,97 @@ class Estimator:
             By column name as in the flight folder, or in order: gnss ``lat, lon, alt[, vel_n, vel_e, vel_d]`` (deg, m, m/s),
             barometer ``pressure`` [Pa], magnetometer ``mag_x, mag_y, mag_z`` [uT].
         variances
-            Of the values in order, for gnss (lat, lon and alt in m^2); NaN or absent: as configured.
+            Of the values in order, for gnss (lat, lon and alt in m^2); NaN, not positive or absent: as configured.
 
         Returns
         -------
         bool
-            False when it was not taken: switched off, not finite, or valid before the fusion horizon. The last is counted.
+            False when it was not taken: switched off, or refused and counted in `discarded`: not finite, impossible, or valid before
+            the fusion horizon.
 
         Raises
         ------
         UsageError
-            Unknown sensor, or too few values.
+            Unknown sensor or name of a value, the wrong number of values, or something that is no number.
         """
+        if sensor not in _VALUES:
+            near = nearest_stream(str(sensor), _VALUES)
+            raise UsageError(
+                "a sensor: gnss, barometer or magnetometer", repr(sensor), "Estimator.offer", f"did you mean {near!r}?" if near else ""
+            )
+        t = _number(t, "t", "Estimator.offer")
+        if not math.isfinite(t):
+            return self._refuse(sensor, "time not finite")
         if sensor == "gnss":
-            names = ("lat", "lon", "alt", "vel_n", "vel_e", "vel_d")
-            v = _in_order(sensor, values, names, 3)
-            r = tuple(variances) if variances is not None else ()
-            if isinstance(values, Mapping) and variances is None:
-                r = tuple(
-                    x * x if x > 0.0 else math.nan
-                    for x in (values.get(k, math.nan) for k in ("h_acc", "h_acc", "v_acc", "s_acc", "s_acc", "s_acc"))
-                )
-            r = r + (math.nan,) * (6 - len(r))
-            taken = False
-            if math.isfinite(v[3] + v[4]):
-                taken = kernels.offer(self._S, self._prm, GNSS_VELOCITY, t, (v[3], v[4], v[5]), (r[3], r[4], r[5])) in (1, -1)
-            if math.isfinite(v[0] + v[1]):
-                taken |= kernels.offer(self._S, self._prm, GNSS_POSITION, t, (v[0], v[1], v[2]), (r[0], r[1], r[2])) in (1, -1)
-            return taken
+            return self._offer_gnss(t, values, variances)
+        if variances is not None:
+            raise UsageError(f"no variances for {sensor}", "some", "Estimator.offer", f"set noise.{sensor}")
         if sensor == "barometer":
-            if isinstance(values, Mapping) and "pressure" not in values:
-                h = float(values.get("altitude", math.nan))
-            else:
-                h = float(altitude_of(np.array(_in_order(sensor, values, ("pressure",), 1)), self.config)[0])
-            if not math.isfinite(h):
-                return False
-            return bool(kernels.offer(self._S, self._prm, BAROMETER, t, (h, math.nan, math.nan), _NAN) in (1, -1))
-        if sensor == "magnetometer":
-            m = _in_order(sensor, values, ("mag_x", "mag_y", "mag_z"), 3)
-            if not math.isfinite(m[0] + m[1] + m[2]) or m == (0.0, 0.0, 0.0):
-                return False
-            return bool(kernels.offer(self._S, self._prm, MAGNETOMETER, t, (m[0], m[1], m[2]), _NAN) in (1, -1))
-        raise UsageError("a sensor: gnss, barometer or magnetometer", repr(sensor), "Estimator.offer")
+            return self._offer_barometer(t, values)
+        m = _in_order(sensor, values, 3)
+        if not math.isfinite(m[0] + m[1] + m[2]):
+            return self._refuse(sensor, "not finite")
+        if m == (0.0, 0.0, 0.0):
+            return self._refuse(sensor, "zero")
+        return self._queue(MAGNETOMETER, t, (m[0], m[1], m[2]), _NAN)
+
+    def _offer_gnss(self, t: float, values: Sequence[float] | Mapping[str, float], variances: Sequence[float] | None) -> bool:
+        v = _in_order("gnss", values, 3, _ACCURACIES)
+        r: tuple[float, ...] = (math.nan,) * 6
+        if variances is not None:
+            r = tuple(_number(x, "a variance", "Estimator.offer") for x in _flat(variances, "variances"))
+            if len(r) > 6:
+                raise UsageError("at most 6 variances for gnss", f"{len(r)}", "Estimator.offer")
+            r = tuple(x if x > 0.0 else math.nan for x in r) + (math.nan,) * (6 - len(r))
+        elif isinstance(values, Mapping):
+            sd = [_number(values.get(k, math.nan), k, "Estimator.offer") for k in _ACCURACIES]
+            r = tuple(x * x if x > 0.0 else math.nan for x in sd)
+        velocity, place = math.isfinite(v[3] + v[4]), math.isfinite(v[0] + v[1])
+        if isinstance(values, Mapping) and _number(values.get("fix_type", 3.0), "fix_type", "Estimator.offer") < 3.0:
+            return self._refuse("gnss", "no 3-D fix")
+        if v[0] == 0.0 and v[1] == 0.0:
+            return self._refuse("gnss", "latitude and longitude zero")
+        if r[0] > 50.0**2:
+            return self._refuse("gnss", "accuracy worse than 50 m")
+        if not (velocity or place):
+            return self._refuse("gnss", "not finite")
+        taken = velocity and self._queue(GNSS_VELOCITY, t, (v[3], v[4], v[5]), (r[3], r[4], r[5]))
+        if place and impossible_place(v[0], v[1]):
+            return self._refuse("gnss", "latitude or longitude impossible") or taken
+        return (place and self._queue(GNSS_POSITION, t, (v[0], v[1], v[2]), (r[0], r[1], r[2]))) or taken
+
+    def _offer_barometer(self, t: float, values: Sequence[float] | Mapping[str, float]) -> bool:
+        if isinstance(values, Mapping) and "pressure" not in values and "altitude" in values:
+            h = _number(values["altitude"], "altitude", "Estimator.offer")
+        else:
+            (pressure,) = _in_order("barometer", values, 1, ("altitude", "temperature"))
+            if impossible_pressure(pressure):
+                return self._refuse("barometer", "pressure impossible in Pa")
+            h = float(altitude_of(np.array([pressure]), self.config)[0])
+        if not math.isfinite(h):
+            return self._refuse("barometer", "not finite")
+        return self._queue(BAROMETER, t, (h, math.nan, math.nan), _NAN)
+
+    def _queue(self, kind: int, t: float, z: tuple[float, float, float], r: tuple[float, float, float]) -> bool:
+        return bool(kernels.offer(self._S, self._prm, kind, t, z, r) in (1, -1))
+
+    def _refuse(self, sensor: str, reason: str) -> bool:
+        """Count a measurement that was not taken; always False."""
+        reasons = self._refused.setdefault(sensor, {})
+        reasons[reason] = reasons.get(reason, 0) + 1
+        return False
+
+    @property
+    def discarded(self) -> dict[str, dict[str, int]]:
+        """What was not taken so far: ``{sensor: {reason: number}}``, as in ``summary.json``."""
+        out = {sensor: dict(reasons) for sensor, reasons in self._refused.items()}
+        if n := int(self._S["n_bad"][0]):
+            out["imu"] = {"refused by the filter": n}
+        for sensor, kinds in (("gnss", (GNSS_POSITION, GNSS_VELOCITY)), ("barometer", (BAROMETER,)), ("magnetometer", (MAGNETOMETER,))):
+            for field, reason in (("n_late", "later than the fusion horizon"), ("n_overflow", "queue full before the first IMU sample")):
+                if n := sum(int(self._S["aid"][field][0, k]) for k in kinds):
+                    out.setdefault(sensor, {})[reason] = n
+        return out
 
     def now(self) -> dict[str, FloatArray | float]:
         """State predicted to the newest IMU sample: ``t``, ``q_nb`` (4,), ``vel_n`` (3,), ``pos_n`` (3,)."""
@@ -296,20 +357,61 @@ class Estimator:
         Raises
         ------
         UsageError
-            The copy is of another layout.
+            No copy, or one of another layout.
         """
+        if not isinstance(snapshot, State):
+            raise UsageError("a State, as Estimator.state gives", type(snapshot).__name__, "Estimator.restore")
         if snapshot.record.dtype != self._S.dtype:
             raise UsageError("a state of the same layout", "one of another", "Estimator.restore")
         self._S[:] = snapshot.record
 
 
-def _in_order(sensor: str, values: Sequence[float] | Mapping[str, float], names: tuple[str, ...], least: int) -> tuple[float, ...]:
-    """Values in the order of their names; NaN for what was not given."""
+def _number(value: Any, name: str, where: str) -> float:
+    try:
+        return float(value)
+    except (TypeError, ValueError):
+        raise UsageError(f"a number for {name}", repr(value), where) from None
+
+
+def _flat(values: Any, name: str) -> tuple[Any, ...]:
+    """The elements of a one-dimensional sequence, or a lone number as one."""
+    n = getattr(values, "ndim", None)
+    if n == 0 or isinstance(values, (int, float)):
+        return (values,)
+    try:
+        if n in (None, 1) and not isinstance(values, str):
+            return tuple(values)
+    except TypeError:
+        pass
+    raise UsageError(f"{name} as a sequence of numbers", f"shape {values.shape}" if n is not None else repr(values), "Estimator.offer")
+
+
+def _three(values: Any, name: str) -> tuple[float, float, float]:
+    try:
+        if getattr(values, "ndim", 1) != 1:
+            raise TypeError
+        x, y, z = values
+        return float(x), float(y), float(z)
+    except (TypeError, ValueError):
+        found = f"shape {values.shape}" if hasattr(values, "shape") else repr(values)
+        raise UsageError(f"three numbers for {name}", found, "Estimator.step", "x, y, z in the body frame (FRD)") from None
+
+
+def _in_order(sensor: str, values: Sequence[float] | Mapping[str, float], least: int, others: tuple[str, ...] = ()) -> tuple[float, ...]:
+    """Values in the order of their names, of which ``least`` must be there; NaN for what was not given. Names may also be ``others``."""
+    names = _VALUES[sensor]
     if isinstance(values, Mapping):
-        v = tuple(float(values.get(n, math.nan)) for n in names)
-    else:
-        v = tuple(float(x) for x in np.atleast_1d(np.asarray(values, dtype=np.float64)))
-        if not least <= len(v) <= len(names):
-            raise UsageError(f"{least} to {len(names)} values for {sensor}: {', '.join(names)}", f"{len(v)}", "Estimator.offer")
-        v = v + (math.nan,) * (len(names) - len(v))
-    return v
+        for name in values:
+            if schema_column(sensor, str(name)) is None:
+                near = nearest_column(str(name), (*names, *others))
+                raise UsageError(
+                    f"values of {sensor} by name ({', '.join(names)})",
+                    repr(name),
+                    "Estimator.offer",
+                    f"did you mean {near!r}?" if near else "",
+                )
+        return tuple(_number(values.get(n, math.nan), n, "Estimator.offer") for n in names)
+    v = tuple(_number(x, f"a value of {sensor}", "Estimator.offer") for x in _flat(values, f"values of {sensor}"))
+    if not least <= len(v) <= len(names):
+        raise UsageError(f"{least} to {len(names)} values for {sensor}: {', '.join(names)}", f"{len(v)}", "Estimator.offer")
+    return v + (math.nan,) * (len(names) - len(v))

@@ -14,16 +14,16 @@ from numpy.typing import NDArray
 from haltere._jit import as_records, entry
 from haltere.aids.record import BAROMETER, GNSS_POSITION, GNSS_VELOCITY, MAGNETOMETER
 from haltere.core.earth import pressure_altitude
-from haltere.core.rotation import Quat, dcm, mat_vec, quat_unit
-from haltere.errors import HaltereError, UsageError
+from haltere.errors import UsageError
 from haltere.flight import config as configuration
 from haltere.flight.config import KEYS, Config
+from haltere.flight.corrections import mounted
 from haltere.flight.door import Checked, first_fix
 from haltere.flight.field import decimal_year, earth_field
 from haltere.flight.log import FlightLog, Stream
 from haltere.strapdown.layout import PARAMETERS
 
-__all__ = ["Measurements", "configure", "horizon", "imu_arrays", "measurements", "parameters"]
+__all__ = ["Measurements", "configure", "horizon", "imu_arrays", "measurements", "parameters", "request"]
 
 FloatArray = NDArray[np.float64]
 
@@ -41,18 +41,16 @@ class Measurements:
     r: FloatArray
 
 
-def configure(
+def request(
     flight: FlightLog,
-    checked: Checked,
     estimator: str,
     preset: str = "default",
     config: Config | Mapping[str, Any] | str | Path | None = None,
     overrides: Mapping[str, Any] | None = None,
 ) -> Config:
-    """Complete configuration of a run: defaults, then the flight's own, then a file or mapping, then single overrides.
+    """What is asked of a run: defaults, then the flight's own, then a file or mapping, then single overrides.
 
-    Home and field that nobody named come from the first 3-D fix and the World Magnetic Model there, so that the configuration
-    that comes back reproduces the run, online too.
+    It needs no sample of the flight; `configure` adds what the samples tell.
     """
     meta = flight.meta
     keys: dict[str, Any] = {"imu.kind": meta.imu_kind}
@@ -70,19 +68,39 @@ def configure(
         given = dict(config.values)
     elif isinstance(config, Mapping):
         given = dict(config)
-    elif config is not None:
+    elif isinstance(config, (str, Path)):
         _, _, given = configuration.load(config)
+    elif config is not None:
+        raise UsageError("a configuration file, a Config or a mapping of keys", type(config).__name__, "config")
+    if overrides is not None and not isinstance(overrides, Mapping):
+        raise UsageError("a mapping of configuration keys", type(overrides).__name__, "set", 'for example set={"gate.gnss": 4}')
     given |= dict(overrides or {})
-    resolved = configuration.resolve(estimator, preset, {**base, **_spread(given)}, "configuration")
-    values = dict(resolved.values)
-    if math.isnan(resolved.number("home.lat")):
+    return configuration.resolve(estimator, preset, {**base, **_spread(given)}, "configuration")
+
+
+def configure(
+    flight: FlightLog,
+    checked: Checked,
+    estimator: str,
+    preset: str = "default",
+    config: Config | Mapping[str, Any] | str | Path | None = None,
+    overrides: Mapping[str, Any] | None = None,
+) -> Config:
+    """Complete configuration of a run, so that it reproduces the run, online too: `request`, and what the samples tell.
+
+    Home and field that nobody named come from the first 3-D fix and the World Magnetic Model there.
+    """
+    asked = request(flight, estimator, preset, config, overrides)
+    values = dict(asked.values)
+    if math.isnan(asked.number("home.lat")):
         fix = first_fix(checked.streams.get("gnss"))
         if fix is not None:
             values |= {"home.lat": fix[0], "home.lon": fix[1], "home.alt": fix[2]}
     elif math.isnan(float(values["home.lon"])) or math.isnan(float(values["home.alt"])):
         raise UsageError("home.lat, home.lon and home.alt together", "only some of them", "configuration")
     if not math.isnan(float(values["home.lat"])):
-        model = earth_field(float(values["home.lat"]), float(values["home.lon"]), float(values["home.alt"]), decimal_year(meta.start_utc))
+        year = decimal_year(flight.meta.start_utc)
+        model = earth_field(float(values["home.lat"]), float(values["home.lon"]), float(values["home.alt"]), year)
         for key, value in (("declination", model.declination), ("dip", model.dip), ("strength", model.strength)):
             if math.isnan(float(values[f"field.{key}"])):
                 values[f"field.{key}"] = value
@@ -114,29 +132,10 @@ def parameters(config: Config) -> NDArray[np.void]:
     return record
 
 
-def _mounted(flight: FlightLog, stream: str, vectors: FloatArray) -> FloatArray:
-    """Vectors of a sensor turned into the body frame by the flight's mounting quaternion q_b_sensor."""
-    q = flight.meta.mounting.get(stream)
-    if q is None:
-        return np.ascontiguousarray(vectors)
-    if not math.isfinite(sum(q)) or abs(math.sqrt(sum(x * x for x in q)) - 1.0) > 1e-2:
-        raise HaltereError("a unit quaternion q_b_sensor", f"{q}", f"flight.toml [mounting] {stream}")
-    out = np.empty_like(vectors)
-    _turn(np.ascontiguousarray(vectors), (float(q[0]), float(q[1]), float(q[2]), float(q[3])), out)
-    return out
-
-
-@entry
-def _turn(vectors: Any, q: Quat, out: Any) -> None:
-    C = dcm(quat_unit(q))
-    for i in range(len(vectors)):
-        out[i, 0], out[i, 1], out[i, 2] = mat_vec(C, (vectors[i, 0], vectors[i, 1], vectors[i, 2]))
-
-
 def imu_arrays(flight: FlightLog, checked: Checked) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Times (n,), angular rates (n, 3) [rad/s] and specific forces (n, 3) [m/s^2] in the body frame."""
     imu = checked.streams["imu"]
-    return imu.t, _mounted(flight, "imu", imu.vector("gyro")), _mounted(flight, "imu", imu.vector("accel"))
+    return imu.t, mounted(flight, "imu", imu.vector("gyro")), mounted(flight, "imu", imu.vector("accel"))
 
 
 @entry
@@ -178,7 +177,7 @@ def measurements(flight: FlightLog, checked: Checked, config: Config) -> Measure
         parts.append((BAROMETER, baro.t[there], np.column_stack([h[there], nan]), np.full((int(there.sum()), 3), np.nan)))
     mag = checked.streams.get("magnetometer")
     if mag is not None and config["aid.magnetometer"] != "off":
-        parts.append((MAGNETOMETER, mag.t, _mounted(flight, "magnetometer", mag.vector("mag")), np.full((len(mag), 3), np.nan)))
+        parts.append((MAGNETOMETER, mag.t, mounted(flight, "magnetometer", mag.vector("mag")), np.full((len(mag), 3), np.nan)))
     if not parts:
         return Measurements(np.empty(0, np.int64), np.empty(0), np.empty((0, 3)), np.empty((0, 3)))
     kind = np.concatenate([np.full(len(t), k, np.int64) for k, t, _, _ in parts])

@@ -11,6 +11,8 @@ from pathlib import Path
 from typing import Any
 
 from haltere.errors import HaltereError, UsageError
+from haltere.flight import axes
+from haltere.flight.units import UNITS, unit_word
 
 __all__ = ["ESTIMATORS", "KEYS", "PRESETS", "Config", "Key", "defaults", "load", "parse_assignment", "resolve"]
 
@@ -60,6 +62,14 @@ def _delay(doc: str) -> Key:
     return Key(0.0, "s", doc, low=0.0, high=2.0)
 
 
+def _unit(unit: str, doc: str) -> Key:
+    return Key(unit, ", ".join(UNITS[unit]), doc, words=tuple(UNITS[unit]))
+
+
+def _axes(doc: str) -> Key:
+    return Key(axes.WORDS[0], "one each of F or B, R or L, D or U", doc, words=axes.WORDS)
+
+
 #: Every key (theory-amendments.md §8 unless said). NaN: from the data.
 KEYS: dict[str, Key] = {
     "noise.gyro": _positive(1.5e-3, "rad/s/sqrt(Hz)", "Gyro white noise density, vibration included. Higher trusts the aids more."),
@@ -107,14 +117,18 @@ KEYS: dict[str, Key] = {
     "arm.gnss_x": Key(0.0, "m", "GNSS antenna ahead of the IMU (FRD)."),
     "arm.gnss_y": Key(0.0, "m", "GNSS antenna right of the IMU."),
     "arm.gnss_z": Key(0.0, "m", "GNSS antenna below the IMU."),
-    "field.declination": Key(math.nan, "rad", "Declination, east positive. Default: World Magnetic Model at home, else 0."),
-    "field.dip": Key(math.nan, "rad", "Dip, down positive. Default: World Magnetic Model at home, else from the first samples."),
-    "field.strength": Key(math.nan, "uT", "Field strength. Default: World Magnetic Model at home, else from the first samples."),
+    "field.declination": Key(
+        math.nan, "rad", "Declination, east positive. Default: World Magnetic Model at home, else 0.", low=-math.pi, high=math.pi
+    ),
+    "field.dip": Key(
+        math.nan, "rad", "Dip, down positive. Default: World Magnetic Model at home, else from the first samples.", low=-1.5708, high=1.5708
+    ),
+    "field.strength": _positive(math.nan, "uT", "Field strength. Default: World Magnetic Model at home, else from the first samples."),
     "field.tolerance_strength": _positive(0.35, "1", "Refuse a sample whose strength is off by more than this fraction."),
     "field.tolerance_dip": _positive(20.0 * DEG, "rad", "Refuse a sample whose dip is off by more than this."),
-    "home.lat": Key(math.nan, "deg", "Origin latitude. Default: the log's home, else the first 3-D fix."),
-    "home.lon": Key(math.nan, "deg", "Origin longitude."),
-    "home.alt": Key(math.nan, "m", "Origin altitude above mean sea level."),
+    "home.lat": Key(math.nan, "deg", "Origin latitude. Default: the log's home, else the first 3-D fix.", low=-90.0, high=90.0),
+    "home.lon": Key(math.nan, "deg", "Origin longitude.", low=-360.0, high=360.0),
+    "home.alt": Key(math.nan, "m", "Origin altitude above mean sea level.", low=-1e4, high=1e5),
     "init.tilt_rest": _positive(3.0 * DEG, "rad", "1 sigma of roll and pitch aligned at rest, without the accelerometer bias."),
     "init.tilt_motion": _positive(10.0 * DEG, "rad", "1 sigma of roll and pitch aligned in motion."),
     "init.yaw_compass": _positive(10.0 * DEG, "rad", "1 sigma of yaw from a compass that passed its tests."),
@@ -132,10 +146,29 @@ KEYS: dict[str, Key] = {
         math.nan, "K", "Air temperature at the ground, scales pressure altitude. Default: standard atmosphere.", low=200.0, high=330.0
     ),
     "baro.offset": _switch("on", "Estimate the barometer offset as a state."),
+    "unit.time": _unit("s", "What the log's time stamps are in, in every stream."),
+    "unit.gyro": _unit("rad/s", "What the log's angular rates are in."),
+    "unit.accel": _unit("m/s^2", "What the log's specific forces are in."),
+    "unit.magnetometer": _unit("uT", "What the log's magnetic field is in: G is gauss, mG milligauss, T tesla."),
+    "unit.pressure": _unit("Pa", "What the log's static pressure is in."),
+    "unit.gnss_position": _unit("deg", "What the log's latitude and longitude are in."),
+    "unit.gnss_altitude": _unit("m", "What the log's GNSS altitude is in."),
+    "unit.gnss_velocity": _unit("m/s", "What the log's GNSS velocity is in."),
+    "axes.gyro": _axes(
+        "Where the gyro's x, y and z point in the body: forward or back, right or left, down or up. `FLU` is forward, left, up; "
+        "`FRU` is a mirrored triad, allowed too."
+    ),
+    "axes.accel": _axes(
+        "The same for the accelerometer. `BLU`, all three turned over, is one that gives gravity instead of specific force."
+    ),
+    "axes.magnetometer": _axes("The same for the magnetometer."),
 }
 
 #: Keys that stand for several, each with what it sets.
-GROUPS: dict[str, tuple[str, ...]] = {"delay.gnss": ("delay.gnss_velocity", "delay.gnss_position")}
+GROUPS: dict[str, tuple[str, ...]] = {
+    "delay.gnss": ("delay.gnss_velocity", "delay.gnss_position"),
+    "axes.imu": ("axes.gyro", "axes.accel"),
+}
 
 #: What an estimator sets differently from the defaults above.
 _OVERRIDES: dict[str, dict[str, Value]] = {
@@ -180,8 +213,8 @@ class Config:
 
 def defaults(estimator: str = "navigator", preset: str = "default") -> dict[str, Value]:
     """Every key with its value before anything is overridden."""
-    if estimator not in PRESETS:
-        near = difflib.get_close_matches(estimator, ESTIMATORS, 1)
+    if str(estimator) not in PRESETS:
+        near = difflib.get_close_matches(str(estimator), ESTIMATORS, 1)
         hint = f"did you mean {near[0]!r}?" if near else f"one of {', '.join(ESTIMATORS)}"
         raise UsageError("an estimator", repr(estimator), "--estimator", hint)
     if preset not in PRESETS[estimator]:
@@ -196,15 +229,19 @@ def _check(key: str, value: Any, where: str) -> Value:
     """Value of a key in its proper type, or an error that says what is wrong."""
     spec = KEYS.get(key)
     if spec is None:
-        near = difflib.get_close_matches(key, [*KEYS, *GROUPS], 1)
+        near = [k for k in (*KEYS, *GROUPS) if k.startswith(key)] or difflib.get_close_matches(key, [*KEYS, *GROUPS], 1)
         raise UsageError(
             "a configuration key", repr(key), where, f"did you mean {near[0]!r}?" if near else "see the documentation's table of keys"
         )
     if spec.words:
-        word = {True: "on", False: "off"}.get(value, str(value)) if isinstance(value, bool) else str(value)
-        if word not in spec.words:
-            raise UsageError(f"{key} to be {spec.unit}", repr(value), where)
-        return word
+        word = {True: "on", False: "off"}[value] if isinstance(value, bool) else str(value).strip()
+        # the word itself, another way to write a unit, or axes in small letters
+        found = next((w for w in (word, unit_word(word), word.upper(), word.lower()) if w in spec.words), None)
+        if found is None:
+            near = [w for w in spec.words if w.lower() == word.lower()] or difflib.get_close_matches(word, spec.words, 1)
+            near = near if spec.words is not axes.WORDS else []
+            raise UsageError(f"{key} to be {spec.unit}", repr(value), where, f"did you mean {near[0]!r}?" if near else "")
+        return found
     try:
         number = float(value)
     except (TypeError, ValueError):

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
+import csv
 import datetime as dt
 import difflib
-import os
-import shutil
-import tempfile
+import io
+import math
 import tomllib
 from collections.abc import Iterable, Mapping
 from pathlib import Path
@@ -18,12 +18,13 @@ from numpy.typing import NDArray
 
 from haltere.errors import HaltereError
 from haltere.flight.log import FlightLog, FlightMeta, Home, Stream
-from haltere.flight.schema import STREAMS, base_name
+from haltere.flight.schema import STREAMS, base_name, column
+from haltere.flight.writing import whole_files
 
 if TYPE_CHECKING:
     import polars as pl
 
-__all__ = ["read", "read_folder", "sniff", "to_column", "write_folder"]
+__all__ = ["csv_table", "parquet_table", "read", "read_folder", "sniff", "to_column", "write_folder"]
 
 TOML = "flight.toml"
 KEYS = (
@@ -35,11 +36,15 @@ FRAMES = ("NED/FRD", "ENU/FLU")
 RESULTS = ("solution", "smoothed", "aids")
 FIELD_KEYS = ("declination", "dip", "strength")
 IMU_KINDS = ("instant", "mean")
+#: Columns of the schema that are text; all others are numbers.
+TEXT_COLUMNS = ("mode",)
 
 
 def sniff(path: Path, head: bytes) -> bool:
-    """Whether a path is a flight folder or its flight.toml."""
-    return (path / TOML).is_file() if path.is_dir() else path.name == TOML
+    """Whether a path is a flight folder or its flight.toml, or a folder of tables that lacks only that."""
+    if not path.is_dir():
+        return path.name == TOML
+    return (path / TOML).is_file() or any(p.suffix in (".csv", ".parquet") and p.is_file() for p in path.iterdir())
 
 
 def write_folder(flight: FlightLog, path: Path | str, *, csv: bool = False) -> Path:
@@ -71,22 +76,10 @@ def write_folder(flight: FlightLog, path: Path | str, *, csv: bool = False) -> P
     """
     path = Path(path)
     suffix = ".csv" if csv else ".parquet"
-    try:
-        if path.exists() and not path.is_dir():
-            raise HaltereError("a folder to write to", "a file", str(path), "name another folder")
-        path.parent.mkdir(parents=True, exist_ok=True)
-        work = Path(tempfile.mkdtemp(prefix=f".{path.name}.writing-", dir=path.parent))
-        try:
-            os.chmod(work, 0o755)
-            for name, stream in flight.streams.items():
-                _write_table(stream, work / (_quoted(name) + suffix))
-            (work / TOML).write_text(_to_toml(flight), encoding="utf-8")
-            _put(work, path)
-        finally:
-            shutil.rmtree(work, ignore_errors=True)
-    except OSError as error:
-        found = error.strerror or str(error)
-        raise HaltereError("a folder that can be written", found, str(path), "check the path, its permissions and the disk") from error
+    with whole_files(path, TOML, _written_before(path)) as work:
+        for name, stream in flight.streams.items():
+            _write_table(stream, work / (_quoted(name) + suffix))
+        (work / TOML).write_text(_to_toml(flight), encoding="utf-8")
     return path
 
 
@@ -122,7 +115,7 @@ def read_folder(path: Path | str) -> FlightLog:
     text: dict[str, list[str]] = _table(doc, "text", file)
     streams: dict[str, Stream] = {}
     for name, table in _tables(path, doc, file):
-        streams[name] = _read_table(table, text.get(name, []))
+        streams[name] = _read_table(name, table, text.get(name, []))
     flight = FlightLog(streams, _meta(doc, file), _texts(doc, "notes", file), _counts(doc, file))
     return _to_ned_frd(flight) if frame == "ENU/FLU" else flight
 
@@ -151,20 +144,12 @@ def _write_table(stream: Stream, path: Path) -> None:
         table.write_parquet(path)
 
 
-def _put(work: Path, path: Path) -> None:
-    """Move a finished folder to its final name, or its files into a folder that is already there."""
-    if not path.exists():
-        os.replace(work, path)
-        return
+def _written_before(path: Path) -> list[str]:
+    """Tables of the flight that is in a folder already."""
     try:
-        before = {t for _, t in _tables(path, tomllib.loads((path / TOML).read_text(encoding="utf-8")), path / TOML)}
+        return [t.name for _, t in _tables(path, tomllib.loads((path / TOML).read_text(encoding="utf-8")), path / TOML)]
     except (OSError, ValueError):
-        before = set()
-    (path / TOML).unlink(missing_ok=True)
-    for old in before:
-        old.unlink(missing_ok=True)
-    for new in sorted(work.iterdir(), key=lambda p: p.name == TOML):
-        os.replace(new, path / new.name)
+        return []
 
 
 def _to_toml(flight: FlightLog) -> str:
@@ -237,7 +222,13 @@ def _table(doc: Mapping[str, Any], key: str, file: Path) -> dict[str, Any]:
 def _number(value: Any, where: str, file: Path) -> float:
     if isinstance(value, bool) or not isinstance(value, int | float):
         raise HaltereError(f"a number for {where}", repr(value), str(file), "write it without quotes")
-    return float(value)
+    try:
+        number = float(value)
+    except OverflowError:  # whole numbers of TOML have no end
+        number = math.inf
+    if not math.isfinite(number):
+        raise HaltereError(f"a finite number for {where}", str(value)[:40], str(file), "leave the key out where there is no value")
+    return number
 
 
 def _numbers(doc: Mapping[str, Any], key: str, file: Path) -> dict[str, float]:
@@ -343,26 +334,109 @@ def _tables(path: Path, doc: Mapping[str, Any], file: Path) -> list[tuple[str, P
     return [(name, found[name]) for name in names]
 
 
-def _read_table(path: Path, text: list[str]) -> Stream:
-    import polars as pl
-
-    try:
-        if path.suffix == ".parquet":
-            table = pl.read_parquet(path)
-        else:
-            # As text first: an empty or all-NaN column must not change its type by what stands in it.
-            table = pl.read_csv(path, infer_schema_length=0)
-    except (pl.exceptions.PolarsError, OSError) as error:
-        found = f"one that cannot be read ({str(error).splitlines()[0]})"
-        raise HaltereError(f"a {path.suffix[1:]} table", found, str(path), "write the table again") from error
+def _read_table(stream: str, path: Path, text: list[str]) -> Stream:
+    table = parquet_table(path) if path.suffix == ".parquet" else csv_table(path)
     columns: dict[str, NDArray[Any]] = {}
     for series in table.get_columns():
         name = series.name if series.name in text else series.name.strip()
-        columns[name] = to_column(series, path, as_text=name in text or None if path.suffix == ".csv" else True)
+        if name in columns:
+            raise HaltereError("columns with names of their own", f"two columns {name!r}", str(path), "rename one of them")
+        known = column(stream, name) is not None
+        if known and name not in TEXT_COLUMNS:
+            columns[name] = _numbers_of(series, path)
+        else:
+            as_text = name in text or known or (None if path.suffix == ".csv" else True)
+            columns[name] = to_column(series, path, as_text=as_text)
     try:
         return Stream(columns)
     except HaltereError as error:
         raise HaltereError(error.expected, error.found, f"{path} {error.where}".strip(), error.remedy) from None
+
+
+def parquet_table(path: Path) -> pl.DataFrame:
+    """A Parquet file as a table.
+
+    Raises
+    ------
+    HaltereError
+        It cannot be read: cut short, damaged, or of another kind.
+    """
+    import polars as pl
+
+    try:
+        return pl.read_parquet(path)
+    except (pl.exceptions.PolarsError, pl.exceptions.PanicException, OSError) as error:
+        # A page that contradicts the file's own description is a panic to polars, which is no Exception.
+        raise _unreadable(path, error) from error
+
+
+def _unreadable(path: Path, error: BaseException) -> HaltereError:
+    found = f"one that cannot be read ({(str(error).splitlines() or [''])[0][:200]})"
+    remedy = "write the table again, or copy it again from where it is whole"
+    return HaltereError(f"a {path.suffix[1:] or 'CSV'} table", found, str(path), remedy)
+
+
+def csv_table(path: Path, separator: str = ",", comment: str | None = None) -> pl.DataFrame:
+    """A CSV file as a table of texts.
+
+    Parameters
+    ----------
+    path
+        The file; its first line names the columns.
+    separator
+        Between the cells.
+    comment
+        What lines begin with that are passed over.
+
+    Raises
+    ------
+    HaltereError
+        Not UTF-8 text, or a line with more cells than there are names; the message has its number. Or it cannot be read at all.
+    """
+    import polars as pl
+
+    data = path.read_bytes()
+    if b"\n" not in data:  # lines that end as they did on a Macintosh
+        data = data.replace(b"\r", b"\n")
+    for bad, what in ((data.find(b"\0"), "a zero byte"), (_not_utf8(data), "a byte that is not UTF-8")):
+        if bad >= 0:
+            line = data.count(b"\n", 0, bad) + 1
+            remedy = "save the table as UTF-8; if its end was never written, cut it there"
+            raise HaltereError("text in UTF-8", f"{what} ({data[bad]:#04x})", f"{path} line {line}", remedy)
+    try:
+        # As text first: an empty or all-NaN column must not change its type by what stands in it.
+        return pl.read_csv(data, separator=separator, infer_schema_length=0, comment_prefix=comment)
+    except pl.exceptions.PolarsError as error:
+        rows = csv.reader(io.StringIO(data.decode("utf-8-sig"), newline=""), delimiter=separator)
+        counts = [(rows.line_num, len(row)) for row in rows if row and not (comment and row[0].startswith(comment))]
+        for line, n in counts:
+            if n > (names := counts[0][1]):
+                expected = f"{names} cells, as many as the header names"
+                raise HaltereError(expected, str(n), f"{path} line {line}", "correct the line") from error
+        raise _unreadable(path, error) from error
+
+
+def _not_utf8(data: bytes) -> int:
+    """Offset of the first byte that is not UTF-8 text, or -1."""
+    try:
+        data.decode("utf-8")
+    except UnicodeDecodeError as error:
+        return error.start
+    return -1
+
+
+def _numbers_of(series: pl.Series, path: Path) -> NDArray[np.float64]:
+    """A column that can only be numbers."""
+    values = to_column(series, path)
+    if values.dtype.kind == "f":
+        return values
+    for i, text in enumerate(values.tolist()):
+        try:
+            float(text or "nan")
+        except ValueError:
+            where = f"{path} column {series.name!r}, row {i + 1}"
+            raise HaltereError("a number", repr(text[:40]), where, "correct the cell, or leave it empty where there is no value") from None
+    raise HaltereError("numbers", "text", f"{path} column {series.name!r}", "write plain decimal numbers")
 
 
 def to_column(series: pl.Series, where: Path | str, *, as_text: bool | None = None) -> NDArray[Any]:

@@ -20,6 +20,36 @@ __all__ = ["FlightLog", "FlightMeta", "Home", "Stream"]
 FloatArray = NDArray[np.float64]
 
 
+def _column(name: str, values: Any) -> NDArray[Any]:
+    """One column as float64, missing values NaN, or as text."""
+    where = f"column {name!r}"
+    if isinstance(values, np.ma.MaskedArray):
+        values = np.ma.filled(values.astype(np.float64), np.nan) if values.dtype.kind in "fiub" else np.ma.filled(values, "")
+    try:
+        array = np.asarray(values)
+    except ValueError:
+        raise HaltereError("one-dimensional columns", "rows of several lengths", where) from None
+    if array.ndim != 1:
+        raise HaltereError("one-dimensional columns", f"shape {array.shape}", where)
+    if array.dtype.kind in "fiub":
+        array = np.ascontiguousarray(array, dtype=np.float64)
+        array = array if array.flags.writeable else array.copy()  # kernels are compiled for arrays that may be written
+    elif array.dtype.kind == "O":
+        if any(isinstance(v, str) for v in array):
+            return np.array(["" if v is None else str(v) for v in array], dtype=np.str_)
+        try:
+            array = np.array(
+                [np.nan if v is None or type(v).__name__ in ("NAType", "NaTType") else float(v) for v in array], dtype=np.float64
+            )
+        except (TypeError, ValueError):
+            raise HaltereError("numbers or text", "other objects", where) from None
+    elif array.dtype.kind == "M":
+        raise HaltereError("numbers or text", f"dates ({array.dtype})", where, "times are seconds as numbers")
+    elif array.dtype.kind != "U":
+        raise HaltereError("numbers or text", f"type {array.dtype}", where)
+    return array
+
+
 class Stream:
     """Columns of one length over one time base.
 
@@ -31,25 +61,19 @@ class Stream:
     Raises
     ------
     HaltereError
-        ``t`` is missing, a column is not one-dimensional, or the lengths differ.
+        ``t`` is missing, a column is not one-dimensional or neither numbers nor text, or the lengths differ.
     """
 
     __slots__ = ("columns",)
 
     def __init__(self, columns: Mapping[str, Any]) -> None:
+        if not isinstance(columns, Mapping) and not (hasattr(columns, "items") and hasattr(columns, "keys")):
+            raise HaltereError("columns by name, such as {'t': [...], 'gyro_x': [...]}", f"a {type(columns).__name__}")
         out: dict[str, NDArray[Any]] = {}
         for name, values in columns.items():
-            array = np.asarray(values)
-            if array.ndim != 1:
-                raise HaltereError("one-dimensional columns", f"shape {array.shape}", f"column {name!r}")
-            if array.dtype.kind in "fiub":
-                array = np.ascontiguousarray(array, dtype=np.float64)
-            elif array.dtype.kind == "O":
-                array = np.array([np.nan if v is None else v for v in array])
-                array = array.astype(np.float64) if array.dtype.kind in "fiub" else array.astype(str)
-            elif array.dtype.kind != "U":
-                raise HaltereError("numbers or text", f"type {array.dtype}", f"column {name!r}")
-            out[name] = array
+            if not isinstance(name, str):
+                raise HaltereError("names of columns as text", repr(name))
+            out[name] = _column(name, values)
         if "t" not in out or out["t"].dtype.kind != "f":
             raise HaltereError("a time column t in seconds", f"columns {', '.join(out) or 'none'}")
         lengths = {name: len(a) for name, a in out.items()}

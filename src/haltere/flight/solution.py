@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import json
-import os
-import shutil
-import tempfile
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -14,8 +12,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from haltere.errors import HaltereError
 from haltere.flight.config import Config
+from haltere.flight.writing import whole_files
 
 if TYPE_CHECKING:
     import polars as pl
@@ -23,6 +21,8 @@ if TYPE_CHECKING:
 __all__ = ["Solution"]
 
 FloatArray = NDArray[np.float64]
+#: The file that says that all are there, and those that not every run writes.
+SUMMARY, FILES = "summary.json", ("smoothed.parquet", "report.html")
 
 
 @dataclass
@@ -83,34 +83,41 @@ class Solution:
         Parameters
         ----------
         folder
-            Where to; made if it is not there. Files of an earlier run are replaced.
+            Where to; made if it is not there. Files of an earlier run are replaced, and taken away where this one has none such.
         extra
             Further text files by name (``report.html``).
 
         Raises
         ------
         HaltereError
-            The folder cannot be written.
+            The folder cannot be written, or there is no room.
+
+        Notes
+        -----
+        ``summary.json`` comes last and is taken away first: where it is, all files are of one run.
         """
         import polars as pl
 
         folder = Path(folder)
-        try:
-            folder.mkdir(parents=True, exist_ok=True)
-            with tempfile.TemporaryDirectory(dir=folder, prefix=".writing-") as name:
-                work = Path(name)
-                self.to_polars().write_parquet(work / "solution.parquet")
-                pl.DataFrame(dict(self.aids)).write_parquet(work / "aids.parquet")
-                (work / "events.json").write_text(json.dumps(self.events, indent=1) + "\n", encoding="utf-8")
-                (work / "summary.json").write_text(json.dumps(self.summary, indent=1, allow_nan=False) + "\n", encoding="utf-8")
-                (work / "config.toml").write_text(self.config.to_toml(), encoding="utf-8")
-                for file, text in (extra or {}).items():
-                    (work / file).write_text(text, encoding="utf-8")
-                for path in sorted(work.iterdir()):
-                    os.replace(path, folder / path.name)
-        except OSError as error:
-            raise HaltereError("a folder that can be written", str(error), str(folder), "give another with --out") from None
-        finally:
-            for left in folder.glob(".writing-*") if folder.is_dir() else ():
-                shutil.rmtree(left, ignore_errors=True)
+        with whole_files(folder, SUMMARY, [name for name in FILES if name not in (extra or {})]) as work:
+            self.to_polars().write_parquet(work / "solution.parquet")
+            pl.DataFrame(dict(self.aids)).write_parquet(work / "aids.parquet")
+            (work / "events.json").write_text(_json(self.events), encoding="utf-8")
+            (work / SUMMARY).write_text(_json(self.summary), encoding="utf-8")
+            (work / "config.toml").write_text(self.config.to_toml(), encoding="utf-8")
+            for file, text in (extra or {}).items():
+                (work / file).write_text(text, encoding="utf-8")
         return folder
+
+
+def _json(value: Any) -> str:
+    """JSON text; numbers that are not finite, which JSON does not have, become null."""
+    return json.dumps(_known(value), indent=1, allow_nan=False) + "\n"
+
+
+def _known(value: Any) -> Any:
+    if isinstance(value, Mapping):
+        return {k: _known(v) for k, v in value.items()}
+    if isinstance(value, list | tuple):
+        return [_known(v) for v in value]
+    return None if isinstance(value, float) and not math.isfinite(value) else value

@@ -1,0 +1,128 @@
+"""Units and axes that a log has other than it should, put right as configured, once, before anything is checked. It finds none itself."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from haltere.errors import HaltereError
+from haltere.flight import axes
+from haltere.flight.log import FlightLog, Stream
+from haltere.flight.schema import base_name
+from haltere.flight.units import factor
+
+__all__ = ["AXES", "UNIT_KEYS", "correct", "mounted"]
+
+FloatArray = NDArray[np.float64]
+
+#: Configuration key of a unit: the kind of stream, its columns, and the unit they should have. Every instance of a stream is meant.
+UNIT_KEYS: dict[str, tuple[str, tuple[str, ...], str]] = {
+    "unit.gyro": ("imu", ("gyro_x", "gyro_y", "gyro_z"), "rad/s"),
+    "unit.accel": ("imu", ("accel_x", "accel_y", "accel_z"), "m/s^2"),
+    "unit.magnetometer": ("magnetometer", ("mag_x", "mag_y", "mag_z"), "uT"),
+    "unit.pressure": ("barometer", ("pressure",), "Pa"),
+    "unit.gnss_position": ("gnss", ("lat", "lon"), "deg"),
+    "unit.gnss_altitude": ("gnss", ("alt",), "m"),
+    "unit.gnss_velocity": ("gnss", ("vel_n", "vel_e", "vel_d"), "m/s"),
+}
+#: Configuration key of axes: the kind of stream, and the stem of its columns.
+AXES: dict[str, tuple[str, str]] = {
+    "axes.gyro": ("imu", "gyro"),
+    "axes.accel": ("imu", "accel"),
+    "axes.magnetometer": ("magnetometer", "mag"),
+}
+
+
+def correct(flight: FlightLog, config: Mapping[str, Any]) -> FlightLog:
+    """A flight in the schema's units and axes, from one in those that the configuration names.
+
+    Parameters
+    ----------
+    flight
+        The log as read. It is not changed.
+    config
+        Values of the keys ``unit.*`` and ``axes.*``; a key that is absent is at its default.
+
+    Returns
+    -------
+    FlightLog
+        The same object where every key is at its default; else a copy whose notes say what was taken as what.
+    """
+    streams = dict(flight.streams)
+    notes: list[str] = []
+    meta = flight.meta
+    unit = str(config.get("unit.time", "s"))
+    if unit != "s":
+        k = factor("s", unit)
+        streams = {name: _with(s, {"t": k * s.t}) for name, s in streams.items()}
+        meta = dataclasses.replace(meta, time_offset=k * meta.time_offset)
+        notes.append(f"all streams: times taken as {unit} as configured (unit.time)")
+    for key, (kind, columns, schema_unit) in UNIT_KEYS.items():
+        unit = str(config.get(key, schema_unit))
+        if unit != schema_unit:
+            for name in _instances(streams, kind):
+                there = [c for c in columns if c in streams[name]]
+                streams[name] = _with(streams[name], {c: factor(schema_unit, unit) * _numbers(streams[name], name, c) for c in there})
+                notes.append(f"{name}: {', '.join(there) or 'nothing'} taken as {unit} as configured ({key})")
+    for key, (kind, stem) in AXES.items():
+        word = str(config.get(key, axes.WORDS[0]))
+        if word != axes.WORDS[0]:
+            for name in _instances(streams, kind):
+                if all(f"{stem}_{a}" in streams[name] for a in "xyz"):
+                    v = np.column_stack([_numbers(streams[name], name, f"{stem}_{a}") for a in "xyz"])
+                    streams[name] = _with(streams[name], _turned(stem, v, word))
+                    notes.append(f"{name}: {stem} x, y, z taken as {word} as configured ({key})")
+    if not notes:
+        return flight
+    return FlightLog(streams, meta, [*flight.notes, *notes], flight.discarded)
+
+
+def _turned(stem: str, v: FloatArray, word: str) -> dict[str, FloatArray]:
+    """Columns of vectors (n, 3) turned into the body: picked and negated, which is exact and keeps NaN in its own axis."""
+    C = axes.matrix(word)
+    source = np.argmax(np.abs(C), axis=1)
+    return {f"{stem}_{a}": float(C[k, source[k]]) * v[:, source[k]] for k, a in enumerate("xyz")}
+
+
+def _instances(streams: Mapping[str, Stream], kind: str) -> list[str]:
+    return [name for name in streams if base_name(name) == kind]
+
+
+def _with(stream: Stream, columns: Mapping[str, FloatArray]) -> Stream:
+    return Stream({**stream.columns, **columns})
+
+
+def _numbers(stream: Stream, name: str, column: str) -> FloatArray:
+    values = stream[column]
+    if values.dtype.kind != "f":
+        raise HaltereError("numbers", f"text such as {str(values[0])!r}", f"stream {name}, column {column}", "check the column map")
+    return values
+
+
+def mounted(flight: FlightLog, stream: str, vectors: FloatArray) -> FloatArray:
+    """Vectors (n, 3) of a sensor turned into the body frame by the flight's mounting quaternion q_b_sensor.
+
+    Raises
+    ------
+    HaltereError
+        The quaternion is not of unit length.
+    """
+    q = flight.meta.mounting.get(stream)
+    if q is None:
+        return np.ascontiguousarray(vectors)
+    parts = [float(x) for x in q]
+    length = math.hypot(*parts)
+    if not (len(parts) == 4 and abs(length - 1.0) <= 1e-2):
+        raise HaltereError("a unit quaternion q_b_sensor", f"{tuple(q)}", f"flight.toml [mounting] {stream}", "scalar first: [w, x, y, z]")
+    w, x, y, z = (part / length for part in parts)
+    C = np.array([
+        [1.0 - 2.0 * (y * y + z * z), 2.0 * (x * y - w * z), 2.0 * (x * z + w * y)],
+        [2.0 * (x * y + w * z), 1.0 - 2.0 * (x * x + z * z), 2.0 * (y * z - w * x)],
+        [2.0 * (x * z - w * y), 2.0 * (y * z + w * x), 1.0 - 2.0 * (x * x + y * y)],
+    ])  # fmt: skip
+    return np.ascontiguousarray(vectors @ C.T)
