@@ -11,6 +11,7 @@ from __future__ import annotations
 import hashlib
 import os
 from collections.abc import Callable
+from functools import lru_cache
 from pathlib import Path
 from typing import TypeVar, cast
 
@@ -25,8 +26,10 @@ __all__ = ["COMPILED", "as_records", "cache_folder", "constant", "entry", "jit"]
 COMPILED = os.environ.get("HALTERE_JIT", "1") != "0"
 _OPEN = os.environ.get("HALTERE_JIT", "1") == "open"
 
-#: Packages whose sources are compiled; a change in any of them makes a new cache folder.
-_KERNEL_ROOMS = ("core", "filter", "strapdown", "aids", "diagnosis", "estimators", "_jit.py")
+#: Rooms whose sources are compiled together; a change in any of them makes a new cache folder. The simulator's kernels stand on
+#: fewer rooms, and nothing stands on them.
+_KERNEL_ROOMS = ("core", "filter", "strapdown", "aids", "diagnosis", "estimators", "vehicle", "_jit.py")
+_SIMULATOR_ROOMS = ("core", "vehicle", "simulate", "_jit.py")
 
 
 def constant(value: int) -> int:
@@ -39,11 +42,12 @@ def as_records(array: NDArray[np.void]) -> NDArray[np.void]:
     return array if COMPILED else array.view(np.recarray)
 
 
-def cache_folder() -> Path:
-    """Folder of the compiled kernels of exactly these sources."""
+@lru_cache(maxsize=2)
+def cache_folder(simulator: bool = False) -> Path:
+    """Folder of the compiled kernels of exactly these sources: of the filter, or of the simulator."""
     here = Path(__file__).parent
     digest = hashlib.sha256()
-    for room in _KERNEL_ROOMS:
+    for room in _SIMULATOR_ROOMS if simulator else _KERNEL_ROOMS:
         for path in sorted([here / room] if room.endswith(".py") else (here / room).glob("*.py")):
             digest.update(path.name.encode())
             digest.update(path.read_bytes())
@@ -56,12 +60,10 @@ def cache_folder() -> Path:
 if COMPILED:
     import numba
 
-    _FOLDER = str(cache_folder())
-
     def _compile(function: F, **options: bool) -> F:
         # no reference counts (_nrt): a kernel only borrows arrays, so that none need be counted at every call, and none can be made
         before = numba.config.CACHE_DIR  # type: ignore[attr-defined]
-        numba.config.CACHE_DIR = _FOLDER  # type: ignore[attr-defined]
+        numba.config.CACHE_DIR = str(cache_folder(function.__module__.startswith("haltere.simulate")))  # type: ignore[attr-defined]
         try:
             compiled: object = numba.njit(cache=True, error_model="numpy", _nrt=False, **options)(function)  # type: ignore[call-overload]
             return cast(F, compiled)
