@@ -69,11 +69,16 @@ if TYPE_CHECKING:
     from haltere.drive import run
     from haltere.errors import HaltereError
     from haltere.estimators.base import Estimator
+    from haltere.evaluate.compare import compare
     from haltere.flight.log import FlightLog, FlightMeta, Home, Stream
     from haltere.flight.solution import Solution
     from haltere.readers import read
+    from haltere.simulate import Scenario, inject, simulate
 
-__all__ = ["Estimator", "FlightLog", "FlightMeta", "HaltereError", "Home", "Solution", "Stream", "__version__", "read", "run"]
+__all__ = [
+    "Estimator", "FlightLog", "FlightMeta", "HaltereError", "Home", "Scenario", "Solution", "Stream", "__version__", "compare", "inject",
+    "read", "run", "simulate",
+]  # fmt: skip
 
 # Where each public name lives: loaded at its first use, so that `import haltere` costs no numba, polars or scipy.
 _HOME = {
@@ -82,17 +87,23 @@ _HOME = {
     "FlightMeta": "haltere.flight.log",
     "HaltereError": "haltere.errors",
     "Home": "haltere.flight.log",
+    "Scenario": "haltere.simulate",
     "Solution": "haltere.flight.solution",
     "Stream": "haltere.flight.log",
+    "compare": "haltere.evaluate.compare",
+    "inject": "haltere.simulate",
     "read": "haltere.readers",
     "run": "haltere.drive",
+    "simulate": "haltere.simulate",
 }
 
 
 def __getattr__(name: str) -> Any:
     if name not in _HOME:
         raise AttributeError(f"module 'haltere' has no attribute {name!r}")
-    value = getattr(import_module(_HOME[name]), name)
+    home = import_module(_HOME[name])
+    # a room of that name is there to stay, whoever imports it, and can be called itself
+    value = home if home.__name__ == f"{__name__}.{name}" else getattr(home, name)
     globals()[name] = value
     return value
 

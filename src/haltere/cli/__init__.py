@@ -201,6 +201,33 @@ def _inject(
 
 
 @app.command(
+    "campaign",
+    short_help="Many runs from a specification.",
+    help="Make many runs from a TOML specification: a grid, a sample or cases of scenario and configuration keys, faults and seeds, or a "
+    "folder of logs; write tables, verdicts and a page. What is interrupted goes on where it was when called again.",
+)
+def _campaign(
+    specification: Annotated[Path, typer.Argument(metavar="SPEC", help="A TOML file.", show_default=False)],
+    workers: Annotated[
+        int | None, typer.Option("--workers", metavar="N", help="Processes. Default: one a core.", show_default=False)
+    ] = None,
+    scheduler: Annotated[
+        str | None,
+        typer.Option("--scheduler", metavar="ADDRESS", help="A Dask scheduler, such as tcp://10.0.0.1:8786.", show_default=False),
+    ] = None,
+    out: Annotated[
+        Path | None, typer.Option("--out", metavar="DIR", help="Folder to write. Default: ./<name>.campaign", show_default=False)
+    ] = None,
+    strict: Annotated[bool, typer.Option("--strict", help="Exit with 1 where a requirement is not met.")] = False,
+    json: Json = False,
+    open_: Open = False,
+) -> None:
+    from haltere.cli.campaign import campaign
+
+    campaign(specification, out, workers=workers, scheduler=scheduler, strict=strict, json=json, show=open_)
+
+
+@app.command(
     "convert", short_help="Any log to a flight folder.", help="Write a log as a flight folder: one table a sensor, SI units, NED and FRD."
 )
 def _convert(

@@ -58,6 +58,7 @@ def document(
     *,
     span: tuple[float, float] | None = None,
     shades: Sequence[tuple[float, float, str]] = (),
+    footer: str = FOOTER,
 ) -> str:
     """A whole page.
 
@@ -75,6 +76,8 @@ def document(
         First and last time of the flight [s]; by default that of the first figure over time.
     shades
         First time, last time [s] and colour (``@name/opacity``) of what is shaded behind every figure over time.
+    footer
+        How the page is to be read, HTML.
 
     Returns
     -------
@@ -84,13 +87,13 @@ def document(
     nav = " ".join(f'<a href="#{key}">{escape(name)}</a>' for key, name in links)
     over_time = [f["layout"]["xaxis"]["range"] for f in figures if f.get("time")]
     content = {"colours": colours(), "span": span or (over_time or [(0.0, 1.0)])[0], "shades": shades, "figures": finite(figures)}
-    empty = _assembled(title, body, nav, to_json({**content, "arrays": []}), b"")
+    empty = _assembled(title, body, nav, to_json({**content, "arrays": []}), b"", footer)
     # In base64 four characters hold three bytes; how the arrays are to be decoded takes some too.
     arrays, data = pool.packed(0.75 * max(LIMIT - len(empty.encode("utf-8")) - DECODING * len(pool), 0))
-    return _assembled(title, body, nav, to_json({**content, "arrays": arrays}), data)
+    return _assembled(title, body, nav, to_json({**content, "arrays": arrays}), data, footer)
 
 
-def _assembled(title: str, body: Sequence[str], nav: str, numbers: str, data: bytes) -> str:
+def _assembled(title: str, body: Sequence[str], nav: str, numbers: str, data: bytes, footer: str) -> str:
     return "\n".join(
         [
             '<!DOCTYPE html>\n<html lang="en">\n<head>\n<meta charset="utf-8">',
@@ -105,7 +108,7 @@ def _assembled(title: str, body: Sequence[str], nav: str, numbers: str, data: by
             '<noscript><p class="trouble">The plots need JavaScript; the tables below do not.</p></noscript>',
             '<p class="trouble" id="trouble" hidden></p>',
             *body,
-            f"</main>\n<footer>haltere {escape(__version__)}. {FOOTER}</footer>",
+            f"</main>\n<footer>haltere {escape(__version__)}. {footer}</footer>",
             f'<script type="application/octet-stream" id="library">{_plotly()}</script>',
             f'<script type="application/octet-stream" id="numbers">{pack(numbers)}</script>',
             f'<script type="application/octet-stream" id="arrays">{base64.b64encode(data).decode("ascii")}</script>',
