@@ -4,6 +4,10 @@ from __future__ import annotations
 
 import dataclasses
 import math
+import os
+import subprocess
+import sys
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -243,3 +247,27 @@ def test_broken_vehicle_files_are_refused(old: str) -> None:
 def test_unknown_vehicle_names_the_nearest() -> None:
     with pytest.raises(UsageError, match="hummingbird"):
         load_vehicle("humingbird")
+
+
+def test_compiled_flight_is_that_of_plain_python(tmp_path: Path) -> None:
+    """The same kernels uncompiled, in a process of their own: every column of every stream."""
+    code = (
+        "import sys, numpy as np\n"
+        "from haltere._jit import COMPILED\n"
+        "from haltere.simulate import Scenario, simulate\n"
+        "wind = {'n': 3.0, 'gust': 1.0, 'shear': 0.2}\n"
+        "flight = simulate(Scenario(mission='lissajous', duration=15.0, rest=0.5, landing=False, wind=wind,\n"
+        "    sensors={'imu': {'preset': 'icm42688', 'arm_x': 0.05}}, fault=('rotor.1:thrust=0.9@10', 'wind.e:step=2m/s@9')))\n"
+        "np.savez(sys.argv[1], compiled=COMPILED, **{f'{s}.{c}': flight[s][c] for s in flight for c in flight[s].names})\n"
+    )
+    made = []
+    for jit in ("0", "1"):
+        path = tmp_path / f"{jit}.npz"
+        subprocess.run([sys.executable, "-c", code, str(path)], check=True, env={**os.environ, "HALTERE_JIT": jit})
+        with np.load(path) as file:
+            made.append(dict(file))
+    plain, compiled = made
+    assert (bool(plain.pop("compiled")), bool(compiled.pop("compiled"))) == (False, True)
+    assert plain.keys() == compiled.keys()
+    for name, column in plain.items():
+        np.testing.assert_allclose(compiled[name], column, rtol=1e-9, atol=1e-9, err_msg=name)

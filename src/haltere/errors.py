@@ -31,6 +31,10 @@ class HaltereError(ValueError):
             text = f"{text}; {remedy}"
         super().__init__(" ".join(text.split()))
 
+    def __reduce__(self) -> tuple[type[HaltereError], tuple[str, str, str, str]]:
+        """The same in another process."""
+        return type(self), (self.expected, self.found, self.where, self.remedy)
+
 
 class UsageError(HaltereError):
     """A wrong option, key, name or preset: the command line exits with 2."""

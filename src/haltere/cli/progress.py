@@ -37,9 +37,10 @@ class Progress:
         """Name what is done now; ``compiles`` where the first use of kernels may compile them."""
         self._words, self._fraction, self._compiles, self._began = words, 0.0, compiles, time.monotonic()
 
-    def update(self, fraction: float) -> None:
-        """Set the fraction done of this stage."""
+    def update(self, fraction: float, words: str | None = None) -> None:
+        """Set the fraction done of this stage, and how it is to be named from now on."""
         self._fraction = fraction
+        self._words = words or self._words
 
     def _show(self) -> None:
         """Draw until done; in a thread of its own, so that work without news still shows life."""

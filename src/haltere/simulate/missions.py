@@ -162,27 +162,31 @@ def reference(
         flying[t < rest] = 0.0
     if lands:
         # come to rest where the mission ends, then down to the ground, then motors off
-        last = int(np.searchsorted(t, end)) - 1
-        speed = (pos[last] - pos[last - 1]) * RATE
+        last = MISSIONS[mission](end - begin + np.array([-0.5, 0.0, 0.5]) / RATE, scale)[0]
+        speed = (last[2] - last[0]) * RATE
         s = t - end
         late = s >= 0.0
         x = np.clip(s / CLIMB, 0.0, 1.0)
         # velocity falls as 1 - smooth step: how far it carries
         carried = CLIMB * (x - x**5 * (7.0 - x * (14.0 - x * (10.0 - 2.5 * x))))
-        pos[late] = (pos[last] + carried[:, None] * speed)[late]
+        pos[late] = (last[1] - np.array([0.0, 0.0, height]) + carried[:, None] * speed)[late]
         down = _smooth((s - CLIMB) / (2.0 * CLIMB))[late]
         pos[late, 2] = pos[late, 2] * (1.0 - down) + 0.02 * down
         flying[s > 3.0 * CLIMB] = 0.0
     return _rows(pos, yaw, flying)
 
 
-def track_reference(t: FloatArray, pos_n: FloatArray, yaw: FloatArray, *, rest: float = REST, height: float = HEIGHT) -> FloatArray:
+def track_reference(
+    t: FloatArray, pos_n: FloatArray, yaw: FloatArray, smoothing: float = 0.05, *, rest: float = REST, height: float = HEIGHT
+) -> FloatArray:
     """Reference along a track of a real flight: smoothed to what a multirotor can follow, flown from the air.
 
     Parameters
     ----------
     t, pos_n, yaw
         Times (n,) [s], positions NED (n, 3) [m] and yaw (n,) [rad]; rows that are not finite are left out.
+    smoothing
+        Weight of the squared acceleration against the squared errors of the points: 0.05 lets half a hertz through, 1 a quarter of it.
     rest
         Time hovering at the first point [s] before the track begins.
     height
@@ -206,13 +210,13 @@ def track_reference(t: FloatArray, pos_n: FloatArray, yaw: FloatArray, *, rest: 
     t, pos_n, yaw = t[slots], pos_n[slots], yaw[slots]
     if len(t) < 8:
         raise UsageError("a track of at least 8 points, 0.2 s apart", f"{len(t)}", "track")
-    s = np.arange(math.ceil((rest + 2.0 + t[-1] - t[0]) * RATE) + 1, dtype=np.float64) / RATE
+    s = np.arange(math.floor((rest + 2.0 + t[-1] - t[0]) * RATE) + 1, dtype=np.float64) / RATE
     # from the first point it sets off gently: its clock starts slowly, and loses two seconds by it
     at = np.minimum(_spin_up(np.maximum(s - rest, 0.0)), t[-1] - t[0])
-    pos = np.column_stack([make_smoothing_spline(t - t[0], pos_n[:, k], lam=0.05)(at) for k in range(3)])
+    pos = np.column_stack([make_smoothing_spline(t - t[0], pos_n[:, k], lam=smoothing)(at) for k in range(3)])
     low = pos[:, 2].max()
     pos -= np.array([pos[0, 0], pos[0, 1], low + height])
-    turned = make_smoothing_spline(t - t[0], yaw, lam=0.05)(at)
+    turned = make_smoothing_spline(t - t[0], yaw, lam=smoothing)(at)
     return _rows(pos, turned, np.ones(len(s)))
 
 

@@ -15,12 +15,14 @@ __all__ = ["track_of"]
 
 FloatArray = NDArray[np.float64]
 
+#: Smoothing (see `haltere.simulate.missions.track_reference`) of what is smooth already, and of GNSS positions.
+SMOOTHING, SMOOTHING_GNSS = 0.05, 1.0
 #: Below this speed [m/s] the course of a GNSS track says nothing of the yaw.
 SLOW = 1.0
 
 
-def track_of(source: str | Path | FlightLog) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Times (n,) [s], positions NED (n, 3) [m] and yaw (n,) [rad] of a flight: of its truth, else onboard, else GNSS.
+def track_of(source: str | Path | FlightLog) -> tuple[FloatArray, FloatArray, FloatArray, float]:
+    """Times (n,) [s], positions NED (n, 3) [m], yaw (n,) [rad] and smoothing of a flight: of its truth, else onboard, else GNSS.
 
     The yaw of a GNSS track is its course, held where it is slow.
 
@@ -44,7 +46,7 @@ def track_of(source: str | Path | FlightLog) -> tuple[FloatArray, FloatArray, Fl
         good = np.isfinite(pos).all(axis=1) & np.isfinite(yaw) & np.isfinite(stream.t)
         order = np.flatnonzero(good)[np.argsort(stream.t[good], kind="stable")]
         if len(order) > 1:
-            return stream.t[order], pos[order], yaw[order]
+            return stream.t[order], pos[order], yaw[order], SMOOTHING_GNSS if name == "gnss" else SMOOTHING
     raise HaltereError("positions in truth, onboard or gnss", f"streams {', '.join(flight)}", f"track {flight.meta.name}")
 
 
