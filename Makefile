@@ -3,7 +3,7 @@
 #   make demo       simulate a flight, run the navigator on it, write its report
 #   make test       the fast tests and a small set of real recordings
 #   make test-all   all tests: statistics over many flights, every real recording
-#   make bench      speed against peers and a C++ twin
+#   make bench      speed, accuracy, reading, start-up and memory beside peers and a C++ twin
 #   make lint       style, types, import rules
 #   make docs       the documentation, into docs/_build/html
 #   make clean      remove what was built; `make distclean` removes the virtual environment too

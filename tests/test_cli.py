@@ -15,7 +15,7 @@ from haltere import cli
 from haltere.errors import HaltereError
 from haltere.flight.folder import write_folder
 from haltere.flight.log import Stream
-from haltere.simulate import demo_flight
+from haltere.simulate import SCENARIOS, demo_flight
 
 OUTPUTS = {"solution.parquet", "aids.parquet", "events.json", "summary.json", "config.toml", "report.html"}
 
@@ -251,12 +251,14 @@ def test_open_shows_the_report(haltere: Caller, log: Path, monkeypatch: pytest.M
 
 
 def test_demo_needs_nothing_and_repeats_itself(haltere: Caller, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("haltere.simulate.demo_flight", lambda seed: demo_flight(seed=seed, duration=26.0, imu_rate=100.0))
+    short = SCENARIOS["demo"].changed(duration=60.0, fault=("magnetometer:disturb=0.3@30-35", "gyro.x:bias=3deg/s@58"))
+    monkeypatch.setitem(SCENARIOS, "demo", short)
     done = haltere("demo")
     assert done.status == 0
     assert {p.name for p in Path("demo.haltere").iterdir()} == OUTPUTS
     assert "report: demo.haltere/report.html" in done.out
     assert "haltere demo --seed 1 --out demo.haltere" in Path("demo.haltere/report.html").read_text(encoding="utf-8")
+    assert "gyro.x:bias=3deg/s@58" in Path("demo.haltere/report.html").read_text(encoding="utf-8")
     again = haltere("demo", "--json", "--out", "again")
     assert json.loads(again.out)["errors"]["truth"]["roll_deg"]["rms"] < 2.0
     assert pl.read_parquet("demo.haltere/solution.parquet").equals(pl.read_parquet("again/solution.parquet"))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import re
 import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -23,6 +24,8 @@ MAGIC = b"H Product:Blackbox flight data recorder"
 DOUBT = 50
 #: No logger pauses longer [us].
 LONGEST_PAUSE = 3600e6
+#: First byte of a frame.
+FRAME_TYPE = re.compile(rb"[IPSGHE]")
 #: Errors in a row, without a frame between them, after which a file is given up.
 HOPELESS = 10_000
 
@@ -171,8 +174,15 @@ class _Frames:
                     self.cut = not any(e.type.name == "LOG_END" for e in self.parser.events)
                     return
                 self.damaged += 1
-                if reader.tell() <= before:
-                    reader.seek(before + 1)
+                reader.seek(self._next_type(max(reader.tell(), before + 1)))
+
+    def _next_type(self, at: int) -> int:
+        """Where the next byte stands that a frame could begin with.
+
+        Started anew on another one, orangebox would go back to the first frame, and read all the log again after every damaged place.
+        """
+        found = FRAME_TYPE.search(self.parser.reader._frame_data, at)
+        return found.start() if found else len(self.parser.reader)
 
     def _dropped(self) -> int:
         return int(self.parser._ctx.invalid_frame_count)

@@ -88,6 +88,7 @@ def streams(flight: FlightLog) -> list[StreamSummary]:
     return [_summary(name, stream) for name, stream in flight.streams.items()]
 
 
+@np.errstate(all="ignore")  # times near the end of the range
 def _summary(name: str, stream: Stream) -> StreamSummary:
     units = {c: known.unit if (known := column(name, c)) is not None else "" for c in stream.names}
     # Rows of a solution come from several topics; its rate is that of its attitude.

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import difflib
-import re
+from collections import Counter
 from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -22,8 +22,6 @@ if TYPE_CHECKING:
 
 __all__ = ["UNITS", "read", "sniff"]
 
-WITH_UNIT = re.compile(r"^(?P<name>.*?)\s*\[(?P<unit>[^\[\]]*)\]\s*$", re.DOTALL)
-WORD = re.compile(r"^\s*\"?[A-Za-z_][^\x00-\x1f]*\"?\s*$")
 PARQUET = b"PAR1"
 #: Streams whose columns are recognised without the stream's name.
 BARE_STREAMS = tuple(name for name in STREAMS if name not in ("onboard", "truth"))
@@ -37,9 +35,14 @@ def sniff(path: Path, head: bytes) -> bool:
     # The header alone decides; damage further down is told by the reader, with its line.
     header = next((line for line in _lines(head) if line.strip() and not line.startswith("#")), "")
     fields = header.split(_delimiter(header))
-    named = sum(bool(WORD.match(f)) for f in fields)
+    named = sum(_is_name(f) for f in fields)
     # A nameless column is the row number that some tools write; one that is no name is damage.
     return named > 1 and 2 * named > sum(bool(f.strip(' "')) for f in fields) and "\0" not in header
+
+
+def _is_name(field: str) -> bool:
+    text = field.strip().strip('"')
+    return text[:1].isascii() and (text[:1].isalpha() or text[:1] == "_") and text.isprintable()
 
 
 def read(path: Path, column_map: Mapping[str, str] | None = None) -> FlightLog:
@@ -121,15 +124,17 @@ def _load(path: Path) -> pl.DataFrame:
     lines = [line for line in _lines(head) if line.strip() and not line.startswith("#")]
     table = csv_table(path, _delimiter(lines[0]) if lines else ",", "#")
     names = [name.strip() for name in table.columns]
-    for name in names:
-        if names.count(name) > 1:
-            raise unusable(path, "columns with names of their own", f"{names.count(name)} columns {name!r}", "rename one of them")
+    if len(set(names)) < len(names):
+        name, n = Counter(names).most_common(1)[0]
+        raise unusable(path, "columns with names of their own", f"{n} columns {name!r}", "rename one of them")
     return table.rename(dict(zip(table.columns, names, strict=True)))
 
 
 def _split_unit(text: str) -> tuple[str, str]:
-    found = WITH_UNIT.match(text)
-    return (found["name"].strip(), found["unit"].strip()) if found else (text.strip(), "")
+    """Name and unit of ``name [unit]``; no unit where nothing stands in brackets at the end."""
+    text = text.strip()
+    name, bracket, unit = text[:-1].rpartition("[") if text.endswith("]") else ("", "", "")
+    return (name.strip(), unit.strip()) if bracket and "]" not in unit else (text, "")
 
 
 def _nearest(word: str, known: list[str]) -> str:
