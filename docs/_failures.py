@@ -509,7 +509,7 @@ def rate(library: str, name: str, key: str, got: Mapping[str, Any], good: Mappin
     if nans > 0.0:
         return Cell(f"NaN in {100 * nans:.3g} % of the rows", "bad")
     change = f"{_short(clean)} → {_short(error)} {unit}{' (tilt)' if what == 'tilt' else ''}"
-    if error <= 1.2 * clean + (0.1 if unit == "°" else 0.05):
+    if error <= 1.2 * clean + (0.5 if unit == "°" else 0.05):
         silent = name == "a misspelt parameter" or name.startswith(("a negative", "sample time"))
         if silent:
             return Cell("accepted in silence", "bad", got["said"])

@@ -125,7 +125,6 @@ def test_wrong_words_are_wrong_usage(haltere: Caller, words: list[str], said: st
         (["--estimator", "ahrs", "--set", "aid.gnss=on"], "ahrs keeps it at off"),
         (["--config", "nowhere.toml"], "expected a configuration file, found no such file"),
         (["--rate", "-5"], "positive number of rows"),
-        (["--smooth"], "smoother"),
         (["--vehicle", "quad.toml"], "vehicle"),
     ],
 )
@@ -238,7 +237,7 @@ def test_a_folder_that_cannot_be_written_is_status_1(haltere: Caller, log: Path)
     Path("taken").write_text("")
     done = haltere("run", log, "--out", "taken")
     assert done.status == 1
-    assert "give another with --out" in done.err.splitlines()[-1]
+    assert "name another folder (--out)" in done.err.splitlines()[-1]
     assert "Traceback" not in done.err
     assert Path("taken").read_text() == ""
 

@@ -69,6 +69,7 @@ if TYPE_CHECKING:
     from haltere.drive import run
     from haltere.errors import HaltereError
     from haltere.estimators.base import Estimator
+    from haltere.evaluate.campaign import campaign
     from haltere.evaluate.compare import compare
     from haltere.flight.log import FlightLog, FlightMeta, Home, Stream
     from haltere.flight.solution import Solution
@@ -76,8 +77,8 @@ if TYPE_CHECKING:
     from haltere.simulate import Scenario, inject, simulate
 
 __all__ = [
-    "Estimator", "FlightLog", "FlightMeta", "HaltereError", "Home", "Scenario", "Solution", "Stream", "__version__", "compare", "inject",
-    "read", "run", "simulate",
+    "Estimator", "FlightLog", "FlightMeta", "HaltereError", "Home", "Scenario", "Solution", "Stream", "__version__", "campaign", "compare",
+    "inject", "read", "run", "simulate",
 ]  # fmt: skip
 
 # Where each public name lives: loaded at its first use, so that `import haltere` costs no numba, polars or scipy.
@@ -90,6 +91,7 @@ _HOME = {
     "Scenario": "haltere.simulate",
     "Solution": "haltere.flight.solution",
     "Stream": "haltere.flight.log",
+    "campaign": "haltere.evaluate.campaign",
     "compare": "haltere.evaluate.compare",
     "inject": "haltere.simulate",
     "read": "haltere.readers",

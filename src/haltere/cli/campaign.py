@@ -65,7 +65,7 @@ def campaign(
         progress.stage("drawing the page")
         from haltere.report.campaign import campaign_page
 
-        page = campaign_page(results, shlex.join(words))
+        page = campaign_page(results.runs, results.faults, results.summary, plan.text, shlex.join(words))
         progress.stage("writing")
         folder = results.save({"campaign.html": page})
     summary = results.summary

@@ -105,6 +105,7 @@ def run(
             str(log),
             "--config",
             str(folder / "config.toml"),
+            *(["--smooth"] if smooth else []),
             *(["--rate", f"{rate:g}"] if rate is not None else []),
             *(["--columns", str(columns)] if columns is not None else []),
             *(word for text in column or [] for word in ("--column", text)),

@@ -27,6 +27,16 @@ def _row(rows: dict[str, dict[str, float]], names: list[tuple[str, str]], unit: 
     return f"  {', '.join(parts)} {unit}" if parts else ""
 
 
+def _errors(what: str, rows: dict[str, dict[str, float]]) -> list[str]:
+    """A heading, and a line each of attitude, velocity and position, where there are any."""
+    shown = [
+        _row(rows, [("roll_deg", "roll"), ("pitch_deg", "pitch"), ("yaw_deg", "yaw")], "deg"),
+        _row(rows, [("vel_n", "velocity north"), ("vel_e", "east"), ("vel_d", "down")], "m/s"),
+        _row(rows, [("pos_n", "position north"), ("pos_e", "east"), ("pos_d", "down")], "m"),
+    ]
+    return [f"{what}, RMS (largest):", *(s for s in shown if s)] if any(shown) else []
+
+
 def lines(solution: Solution, flight: FlightLog, folder: Path) -> list[str]:
     """The summary for people."""
     from haltere.report.words import verdict_of
@@ -39,13 +49,11 @@ def lines(solution: Solution, flight: FlightLog, folder: Path) -> list[str]:
         f"aligned at t = {summary['aligned_at']:.2f} s",
     ]
     for name, rows in summary["errors"].items():
-        shown = [
-            _row(rows, [("roll_deg", "roll"), ("pitch_deg", "pitch"), ("yaw_deg", "yaw")], "deg"),
-            _row(rows, [("vel_n", "velocity north"), ("vel_e", "east"), ("vel_d", "down")], "m/s"),
-            _row(rows, [("pos_n", "position north"), ("pos_e", "east"), ("pos_d", "down")], "m"),
-        ]
-        if any(shown):
-            out += [f"{'error against truth' if name == 'truth' else f'difference from {name}'}, RMS (largest):", *(s for s in shown if s)]
+        out += _errors("error against truth" if name == "truth" else f"difference from {name}", rows)
+    if "smoothed" in summary:
+        out.append("smoothed over the whole run: smoothed.parquet")
+        for name, rows in summary["smoothed"]["errors"].items():
+            out += _errors("smoothed: error against truth" if name == "truth" else f"smoothed: difference from {name}", rows)
     if summary["health"]:
         out.append("health: " + ", ".join(f"{sensor} {h['verdict']}" for sensor, h in summary["health"].items()))
     for event in [e for e in solution.events if e["kind"] != "aligned"][:8]:

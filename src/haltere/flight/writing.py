@@ -51,7 +51,7 @@ def whole_files(folder: Path, last: str, stale: Iterable[str] = ()) -> Iterator[
     beside = f".{folder.name}{MARK}"
     with _told(folder):
         if folder.exists() and not folder.is_dir():
-            raise HaltereError("a folder to write to", "a file", str(folder), "name another folder")
+            raise HaltereError("a folder to write to", "a file", str(folder), "name another folder (--out)")
         folder.parent.mkdir(parents=True, exist_ok=True)
         _sweep(folder.parent, beside)
         _sweep(folder, MARK)
@@ -137,7 +137,7 @@ def _told(folder: Path) -> Iterator[None]:
         found = getattr(error, "strerror", None) or OS_ERROR.sub("", words)
     else:
         return
-    remedy = "check the path and its permissions, or name another folder"
+    remedy = "check the path and its permissions, or name another folder (--out)"
     if code in NO_ROOM:
         remedy = "make room there, or name a folder on another disk"
     raise HaltereError("a folder that can be written", found, str(folder), remedy)

@@ -70,6 +70,7 @@ def vectors(mag: Stream) -> FloatArray:
     return np.asarray(np.where((m == 0.0).all(axis=1, keepdims=True), np.nan, m))
 
 
+@np.errstate(all="ignore")  # samples near the end of the range are damaged ones
 def field_series(solution: Solution, flight: FlightLog, stream: str = "magnetometer") -> FieldSeries | None:
     """Measured strength and dip of the field; None without three samples. Zero is no field, so it counts as no sample."""
     mag = flight.get(stream)

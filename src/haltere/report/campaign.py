@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from haltere.evaluate.campaign import Results
-from haltere.evaluate.campaign_run import DONE
-from haltere.evaluate.campaign_tables import (
+from haltere.metrics.campaign import (
+    DONE,
     MISSED,
     NOBODY,
     by_size,
@@ -21,7 +21,7 @@ from haltere.evaluate.campaign_tables import (
     of_estimator,
     quartiles,
     roc,
-)
+)  # fmt: skip
 from haltere.report.document import document
 from haltere.report.grid import Grid
 from haltere.report.markup import Section, escape, section_html, table
@@ -49,6 +49,12 @@ UNITS = {
     **{("accel", kind): "m/s²" for kind in ("bias", "noise", "spike", "saturate")}, ("accel", "ramp"): "m/s³",
     ("magnetometer", "disturb"): "of the field", ("magnetometer", "bias"): "µT", ("rotor", "thrust"): "factor", ("wind", "step"): "m/s",
 }  # fmt: skip
+#: Errors that settle: name, unit, factor.
+SETTLING = {
+    "tilt_deg": ("tilt", "deg", 1.0), "heading_deg": ("heading", "deg", 1.0), "vel": ("velocity", "m/s", 1.0),
+    "pos": ("position", "m", 1.0), "wind": ("wind", "m/s", 1.0), "gyro_bias": ("gyro bias", "deg/s", DEG),
+    "accel_bias": ("accel. bias", "m/s²", 1.0),
+}  # fmt: skip
 #: Most values of a factor that have a box each, points of a scatter, and different failures listed.
 BOXES, POINTS, FAILURES = 16, 600, 20
 FOOTER = (
@@ -57,13 +63,29 @@ FOOTER = (
 )
 
 
-def campaign_page(results: Results, command: str | None = None) -> str:
+@dataclass(frozen=True)
+class _Results:
+    """What the page shows."""
+
+    runs: pl.DataFrame
+    faults: pl.DataFrame
+    summary: dict[str, Any]
+    specification: str
+
+
+def campaign_page(
+    runs: pl.DataFrame, faults: pl.DataFrame, summary: dict[str, Any], specification: str = "", command: str | None = None
+) -> str:
     """A campaign as one HTML page that loads nothing from outside.
 
     Parameters
     ----------
-    results
-        What `haltere.evaluate.campaign.campaign` gave back.
+    runs, faults
+        Tables of ``results.parquet`` and ``faults.parquet``.
+    summary
+        As in ``summary.json``.
+    specification
+        As written.
     command
         The command line that gives it again.
 
@@ -72,6 +94,7 @@ def campaign_page(results: Results, command: str | None = None) -> str:
     str
         The text of ``campaign.html``.
     """
+    results = _Results(runs, faults, summary, specification)
     names = estimators(results.runs)
     colours = {n: "estimate" if k == 0 else f"other{(k - 1) % OTHERS}" for k, n in enumerate(names)}
     sections = [
@@ -82,7 +105,7 @@ def campaign_page(results: Results, command: str | None = None) -> str:
     figures: list[Figure] = []
     body = [_header(results), *(section_html(s, figures) for s in shown)]
     links = [(s.key, s.title) for s in shown]
-    return document(f"{results.plan.name}, a campaign", body, links, figures, Pool(), span=(0.0, 1.0), footer=FOOTER)
+    return document(f"{results.summary['name']}, a campaign", body, links, figures, Pool(), span=(0.0, 1.0), footer=FOOTER)
 
 
 def _values(table_: pl.DataFrame, name: str) -> FloatArray:
@@ -97,7 +120,7 @@ def _named(name: str, colours: dict[str, str]) -> str:
     return f'<span style="color:var(--{colours.get(name, "quiet")})">&#9632;</span> {escape(name)}'
 
 
-def _header(results: Results) -> str:
+def _header(results: _Results) -> str:
     summary = results.summary
     level = {"passed": "good", "failed": "bad"}.get(summary["verdict"], "doubtful")
     badge = {"passed": "requirements met", "failed": "requirements not met"}.get(summary["verdict"], "no requirements")
@@ -110,20 +133,19 @@ def _header(results: Results) -> str:
     sentences = [r["verdict"] for r in summary["requirements"]] or ["The specification asks for nothing: add [[require]] to have verdicts."]
     items = "".join(f"<li>{escape(s[:1].upper() + s[1:])}.</li>" if not s.endswith(".") else f"<li>{escape(s)}</li>" for s in sentences)
     return (
-        f"<header>\n<h1>{escape(results.plan.name)}: a campaign</h1>\n"
+        f"<header>\n<h1>{escape(results.summary['name'])}: a campaign</h1>\n"
         f'<section class="verdict {level}" id="verdict"><p class="headline"><span class="badge">{badge}</span> '
         f"{escape(', '.join(said))}.</p><ul>{items}</ul></section>\n</header>"
     )
 
 
-def _requirements(results: Results) -> Section:
+def _requirements(results: _Results) -> Section:
     section = Section("requirements", "Requirements", "A run that failed, or has no value, counts as the worst there is.")
     rows = []
-    for v in results.verdicts:
-        interval = "–" if v.interval is None else f"{number(v.interval[0])} … {number(v.interval[1])}"
-        rows.append(
-            ("met" if v.met else "<b>not met</b>", escape(v.requirement.words), number(v.value), interval, f"{v.runs:,}", f"{v.failed:,}")
-        )
+    for v in results.summary["requirements"]:
+        interval = "–" if v["interval"] is None else " … ".join(number(x) for x in v["interval"])
+        met = "met" if v["met"] else "<b>not met</b>"
+        rows.append((met, escape(v["requirement"]), number(v["value"]), interval, f"{v['runs']:,}", f"{v['failed']:,}"))
     if rows:
         section.after = table(("verdict ", "requirement ", "found", "interval", "runs", "failed"), rows)
     return section
@@ -143,9 +165,9 @@ def _against(runs: pl.DataFrame) -> str:
     return "Errors against truth; where a log has none, differences from the autopilot's own estimate. " if "onboard" in said else ""
 
 
-def _errors(results: Results, colours: dict[str, str]) -> Section:
+def _errors(results: _Results, colours: dict[str, str]) -> Section:
     """Distributions over runs, and their table."""
-    runs, settle = results.runs, results.plan.settle
+    runs, settle = results.runs, results.summary["settle"]
     section = Section("errors", "Errors")
     metrics = _drawn(runs)
     if not metrics:
@@ -185,7 +207,7 @@ def _errors(results: Results, colours: dict[str, str]) -> Section:
     for estimator in colours:
         mine = of_estimator(runs, estimator)
         done = int((mine["status"] == DONE).sum())
-        for key, bound in results.plan.bounds.items():
+        for key, bound in results.summary["bounds"].items():
             if (
                 f"{key}.settling" not in mine.columns
                 or f"{key}.rms" not in mine.columns
@@ -195,10 +217,8 @@ def _errors(results: Results, colours: dict[str, str]) -> Section:
             values = _values(mine, f"{key}.settling")
             known = values[np.isfinite(values)]
             middle, late = (float(np.quantile(known, q)) for q in (0.5, 0.95)) if len(known) else (math.nan, math.nan)
-            words = key.removesuffix("_deg").replace("_", " ").replace("vel", "velocity").replace("pos", "position")
-            within = (
-                f"{number(bound)} deg" if key.endswith("_deg") else f"{number(bound * DEG)} deg/s" if key == "gyro_bias" else number(bound)
-            )
+            words, unit, factor = SETTLING[key]
+            within = f"{number(factor * bound)} {unit}"
             cells = (number(middle), number(late), f"{len(known):,} of {done:,}")
             settled.append((_named(estimator, colours), escape(words), escape(within), *cells))
     if settled:
@@ -207,12 +227,12 @@ def _errors(results: Results, colours: dict[str, str]) -> Section:
     return section
 
 
-def _factors(results: Results, colours: dict[str, str]) -> Section:
+def _factors(results: _Results, colours: dict[str, str]) -> Section:
     """Errors by each factor that has more than one value: boxes, or points where it has many."""
     runs = results.runs
     section = Section("factors", "Errors by factor", "Box: the middle half of the runs, line: the median, whiskers: 5 to 95 %.")
     metrics = [m for m in _drawn(runs) if m[0] in ("tilt_deg.rms", "heading_deg.rms", "vel.rms", "pos.rms", "wind.rms")]
-    for factor in results.plan.varied:
+    for factor in results.summary["varied"]:
         if factor in ("seed", "estimator") or not metrics or factor not in runs.columns:
             continue
         cells = runs[factor].to_list()
@@ -289,7 +309,7 @@ def _points(runs: pl.DataFrame, factor: str, metrics: Any, colours: dict[str, st
 # --- detection -----------------------------------------------------------------------------------------------------------
 
 
-def _detection(results: Results, colours: dict[str, str]) -> Section:
+def _detection(results: _Results, colours: dict[str, str]) -> Section:
     """Detected, isolated, false alarms; delays over sizes, operating curve, confusion."""
     runs, faults = results.runs, results.faults
     section = Section("detection", "Faults and alarms")
@@ -317,7 +337,7 @@ def _detection(results: Results, colours: dict[str, str]) -> Section:
     heads = ("estimator", "detected ", "share", "named alone", "named, others too", "false alarms / h", "alarms ")
     section.note = (
         "Shares are of all faults injected while the estimator ran. In brackets exact 95 % intervals (Clopper and Pearson; Garwood). "
-        f"An alarm up to {results.plan.hold:g} s after a fault counts as its."
+        f"An alarm up to {results.summary['hold']:g} s after a fault counts as its."
     )
     section.after = table(heads, rows)
     if not detected.any():
@@ -348,10 +368,10 @@ def _delays(faults: pl.DataFrame, colours: dict[str, str]) -> list[Figure]:
         grid = Grid(f"delay_{sensor}_{kind}", ["detected", "delay [s]"], f"size [{unit}]", 140)
         first: set[str] = set()
         sizes = np.unique(np.concatenate([b.size for b in mine]))
-        gap = float(np.min(np.diff(sizes))) if len(sizes) > 1 else max(float(sizes[0]), 1e-9)
+        span = float(sizes[-1] - sizes[0]) or max(float(sizes[0]), 1e-9)  # estimators stand beside each other
         top = 0.0
         for i, b in enumerate(mine):
-            shift = 0.0 if len(mine) == 1 else 0.12 * gap * (2.0 * i / (len(mine) - 1) - 1.0)
+            shift = 0.0 if len(mine) == 1 else 0.008 * span * (2.0 * i / (len(mine) - 1) - 1.0)
             x = [float(f"{v:.4g}") for v in b.size + shift]
             look: dict[str, Any] = {
                 "type": "scatter", "mode": "lines+markers", "x": x, "marker": {"size": 7, "color": f"@{colours[b.estimator]}"},
@@ -404,7 +424,7 @@ def _curves(runs: pl.DataFrame, faults: pl.DataFrame, colours: dict[str, str]) -
 # --- consistency ---------------------------------------------------------------------------------------------------------
 
 
-def _consistency(results: Results, colours: dict[str, str]) -> Section:
+def _consistency(results: _Results, colours: dict[str, str]) -> Section:
     """Means over runs of NEES and NIS, with their bands."""
     section = Section("consistency", "Is the stated uncertainty true?")
     entries = consistency(results.runs)
@@ -469,7 +489,7 @@ def _means(name: str, words: str, entries: Any, colours: dict[str, str]) -> Figu
 # --- what was done -------------------------------------------------------------------------------------------------------
 
 
-def _failures(results: Results) -> Section:
+def _failures(results: _Results) -> Section:
     section = Section("failures", "Runs that failed")
     failures = list(results.summary["failures"].items())[:FAILURES]
     if failures:
@@ -477,18 +497,19 @@ def _failures(results: Results) -> Section:
     return section
 
 
-def _done(results: Results, command: str | None) -> Section:
+def _done(results: _Results, command: str | None) -> Section:
     """Factors, seconds, and the command."""
-    plan, summary = results.plan, results.summary
+    runs, summary = results.runs, results.summary
     section = Section("done", "What was done")
     rows = []
-    for factor in plan.factors:
-        values = [r.factors.get(factor) for r in plan.runs]
+    ends = [c for c in ("status", "error") if c in runs.columns]
+    for factor in [c for c in runs.columns[: runs.columns.index(ends[0]) if ends else 0] if c not in ("run", "id")]:
+        values = runs[factor].to_list()
         levels = list(dict.fromkeys(_level(v) for v in values))
         text = ", ".join(levels) if len(levels) <= BOXES else f"{len(levels):,} values, {levels[0]} to {levels[-1]}"
-        if len(levels) > BOXES and all(isinstance(v, int | float) for v in values):
-            numeric = [float(v) for v in values if v is not None]
-            text = f"{len(levels):,} values from {number(min(numeric))} to {number(max(numeric))}"
+        if len(levels) > BOXES and runs[factor].dtype.is_numeric():
+            known = _values(runs, factor)
+            text = f"{len(levels):,} values from {number(float(np.nanmin(known)))} to {number(float(np.nanmax(known)))}"
         rows.append((escape(factor), text))
     section.after = table(("factor", "values "), rows)
     timings = summary["timings"]
@@ -496,10 +517,13 @@ def _done(results: Results, command: str | None) -> Section:
         (words, timings.get(key)) for words, key in (("simulating or reading", "flight_s"), ("estimating", "run_s"), ("scoring", "score_s"))
     ]
     section.after += table(("work of all runs", "seconds"), [(words, number(s)) for words, s in took if s is not None])
-    notes = [*summary["notes"], *([f"{plan.same:,} combinations are the same run as another, and were made once"] if plan.same else [])]
+    notes = [
+        *summary["notes"],
+        *([f"{summary['same']:,} combinations are the same run as another, and were made once"] if summary["same"] else []),
+    ]
     section.after += "".join(f"<p>{escape(n[:1].upper() + n[1:])}.</p>" for n in notes)
     if command:
         section.after += f'<p>Once more, or on from where it stopped:</p><pre class="command">{escape(command)}</pre>'
-    if plan.text:
-        section.after += f"<details><summary>Specification</summary><pre>{escape(plan.text)}</pre></details>"
+    if results.specification:
+        section.after += f"<details><summary>Specification</summary><pre>{escape(results.specification)}</pre></details>"
     return section

@@ -100,6 +100,12 @@ class Context:
         return np.degrees(euler(self.solution.vector("q", "wxyz")))
 
     @cached_property
+    def smoothed_angles(self) -> FloatArray:
+        """Roll, pitch, yaw [deg] of the smoothed rows (n, 3); none where the run was not smoothed."""
+        s = self.solution.smoothed
+        return np.degrees(euler(s.vector("q", "wxyz"))) if s is not None else np.empty((0, 3))
+
+    @cached_property
     def tilt(self) -> FloatArray:
         """Angle between the body's and the true vertical [deg]."""
         x, y = self.solution["q_x"], self.solution["q_y"]

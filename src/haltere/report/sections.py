@@ -32,6 +32,14 @@ def _sd(c: Context, name: str, factor: float = 1.0) -> FloatArray | None:
     return factor * c.solution[name] if name in c.solution else None
 
 
+def _smoothed(c: Context, panels: Panels, row: int, name: str, unit: str, factor: float = 1.0, resolution: float = 1e-3) -> None:
+    """The smoothed quantity with 1σ, where the run was smoothed."""
+    s = c.solution.smoothed
+    if s is not None and name in s:
+        sd = factor * s[f"sd_{name}"] if f"sd_{name}" in s else None
+        panels.line(row, "smoothed", "smoothed", s.t, factor * s[name], sd, unit=unit, resolution=resolution, width=1.4, slow=True)
+
+
 def angle_columns(c: Context, k: int) -> tuple[FloatArray, list[FloatArray], list[float], float | None]:
     """Times, angle and 1σ [deg], resolutions and period of roll, pitch or yaw (0, 1, 2), as `Pool.series` takes them."""
     columns = [c.angles[:, k]]
@@ -47,6 +55,11 @@ def attitude(c: Context) -> Section:
     for k in range(3):
         t, columns, _, period = angle_columns(c, k)
         panels.line(k, "estimate", "estimate", t, *columns, unit="deg", period=period)
+        if c.solution.smoothed is not None:
+            s, sd = c.solution.smoothed, f"sd_{('roll', 'pitch', 'yaw')[k]}"
+            panels.line(
+                k, "smoothed", "smoothed", s.t, c.smoothed_angles[:, k], DEG * s[sd], unit="deg", period=period, width=1.4, slow=True
+            )
         for name, stream in c.references:
             q = stream.vector("q", "wxyz")
             good = np.isfinite(q).all(axis=1)
@@ -64,6 +77,7 @@ def velocity(c: Context) -> Section | None:
         t, v = c.measured(f"vel_{a}")
         panels.line(k, "GNSS", "gnss", t, v, unit="m/s", width=1.0)
         panels.line(k, "estimate", "estimate", c.solution.t, c.solution[f"vel_{a}"], _sd(c, f"sd_vel_{a}"), unit="m/s")
+        _smoothed(c, panels, k, f"vel_{a}", "m/s")
         for name, stream in c.references:
             panels.line(k, name, name, stream.t, stream.get(f"vel_{a}"), unit="m/s", width=1.0)
     return Section(
@@ -89,6 +103,7 @@ def position(c: Context) -> Section | None:
         if a == "d":
             _barometer(c, panels, k)
         panels.line(k, "estimate", "estimate", c.solution.t, c.solution[f"pos_{a}"], _sd(c, f"sd_pos_{a}"), unit="m")
+        _smoothed(c, panels, k, f"pos_{a}", "m")
         for name, stream in c.references:
             tp, p = reference_position(stream, list(c.origin) if c.origin else None)
             panels.line(k, name, name, tp, p[:, k], unit="m", width=1.0)
@@ -116,6 +131,7 @@ def biases(c: Context) -> Section | None:
     for k, (name, _, unit, factor, resolution) in enumerate(groups):
         y = factor * c.solution[name]
         panels.line(k, "estimate", "estimate", c.solution.t, y, _sd(c, f"sd_{name}", factor), unit=unit, resolution=resolution, slow=True)
+        _smoothed(c, panels, k, name, unit, factor, resolution)
         for label, stream in c.references:
             panels.line(k, label, label, stream.t, factor * stream.get(name), unit=unit, resolution=resolution, width=1.0)
     return Section("biases", "Sensor biases", "Measured minus true; the estimate is subtracted from the sensor.", [panels.figure()])
@@ -143,6 +159,7 @@ def errors(c: Context) -> Section | None:
     names = [n for n in ("roll", "pitch", "yaw", "vel_n", "vel_e", "vel_d", "pos_n", "pos_e", "pos_d") if n in series]
     if not names:
         return None
+    smoothed = error_series(c.solution.smoothed, truth) if c.solution.smoothed is not None else {}
     figures = []
     for group, title in (("", "attitude"), ("vel", "velocity"), ("pos", "position")):
         mine = [n for n in names if n.rpartition("_")[0] == group]
@@ -157,6 +174,9 @@ def errors(c: Context) -> Section | None:
             panels.line(k, "estimate less truth", "estimate", t, factor * e, at, unit=unit, centred=True)
             if at is not None:
                 panels.multiples(k, "±3σ", 3.0)
+            if name in smoothed:
+                t, e = smoothed[name]
+                panels.line(k, "smoothed less truth", "smoothed", t, factor * e, unit=unit, width=1.2)
         figures.append({**panels.figure(), "title": title})
     note = "The band is what the filter states: the error should lie inside for two thirds of the time, and nearly always between the dots."
     return Section("errors", "Errors against truth", note, figures)

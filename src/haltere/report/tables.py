@@ -24,9 +24,15 @@ _UNITS = {
 
 
 def errors_table(c: Context) -> str:
-    """RMS and largest error against each reference."""
+    """RMS and largest error against each reference, of the filter and of what was smoothed."""
+    summary = c.solution.summary
+    out = _errors_table(summary.get("errors", {}), "")
+    return out + _errors_table(summary.get("smoothed", {}).get("errors", {}), "smoothed: ")
+
+
+def _errors_table(errors: dict[str, Any], whose: str) -> str:
     out = ""
-    for name, rows in c.solution.summary.get("errors", {}).items():
+    for name, rows in errors.items():
         if not rows:
             continue
         cells = []
@@ -36,7 +42,7 @@ def errors_table(c: Context) -> str:
             label = key.removesuffix("_deg").replace("_", " ")
             cells.append((escape(label), number(factor * row["rms"]), number(factor * row["max"]), escape(unit), f"{row.get('n', 0):,}"))
         what = "errors against truth" if name == "truth" else f"differences from {name}"
-        out += table(("quantity", "RMS", "largest", "unit ", "samples"), cells, caption=what)
+        out += table(("quantity", "RMS", "largest", "unit ", "samples"), cells, caption=whose + what)
     return out
 
 
@@ -62,6 +68,12 @@ def consistency(c: Context) -> Section:
     if rows:
         caption = "squared errors over their stated variance a degree of freedom (NEES), against truth; 1 is ideal"
         section.after += table(("block", "mean NEES", "95 % band", "degrees of freedom"), rows, caption=caption)
+        rows = [
+            (escape(block.replace("_", " ")), number(v["mean"]), f"{number(v['band'][0])} … {number(v['band'][1])}", f"{v['dof']}")
+            for block, v in summary.get("smoothed", {}).get("nees", {}).items()
+        ]
+        if rows:
+            section.after += table(("block", "mean NEES", "95 % band", "degrees of freedom"), rows, caption="NEES of the smoothed solution")
     elif nis:
         section.after += "<p>No NEES: it needs a truth, and this flight has none.</p>"
     section.after += errors_table(c)
