@@ -605,7 +605,7 @@ def damage_parquet(data: bytes, rng: Rng) -> bytes:
 
     try:
         table = pl.read_parquet(io.BytesIO(data))
-    except Exception:  # damaged before
+    except (Exception, pl.exceptions.PanicException):  # damaged before
         return damage_bytes(data, rng)
     if not table.width:
         return damage_bytes(data, rng)
@@ -825,6 +825,7 @@ def work(folder: Path, kinds: Iterable[str], draw: bool) -> None:
         shutil.rmtree(place, ignore_errors=True)
         rng = _random(kind, number)
         path = lay(damaged(kind, rng), place)
+        os.ftruncate(said, 0)  # of making the case
         signal.setitimer(signal.ITIMER_VIRTUAL, CPU_SECONDS)
         verdict = judge(path, rng.randrange(DRAW_EVERY * 4), draw=draw)
         signal.setitimer(signal.ITIMER_VIRTUAL, 0.0)

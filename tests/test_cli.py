@@ -300,3 +300,21 @@ def test_every_error_has_a_status() -> None:
     from haltere.errors import UsageError
 
     assert (HaltereError("a", "b").exit_status, UsageError("a", "b").exit_status) == (1, 2)
+
+
+def test_smooth_writes_a_table_and_says_so(haltere: Caller, log: Path) -> None:
+    done = haltere("run", log, "--smooth", "--out", "smooth")
+    assert done.status == 0
+    assert {p.name for p in Path("smooth").iterdir()} == OUTPUTS | {"smoothed.parquet"}
+    assert "smoothed over the whole run: smoothed.parquet" in done.out
+    assert "smoothed: error against truth, RMS (largest):" in done.out
+    page = Path("smooth/report.html").read_text(encoding="utf-8")
+    assert "--smooth" in page
+    assert "smoothed: errors against truth" in page
+    smoothed, solution = pl.read_parquet("smooth/smoothed.parquet"), pl.read_parquet("smooth/solution.parquet")
+    assert smoothed.columns == solution.columns
+    assert smoothed["t"].equals(solution["t"])
+    errors = json.loads(Path("smooth/summary.json").read_text(encoding="utf-8"))
+    assert errors["smoothed"]["errors"]["truth"]["roll_deg"]["rms"] < errors["errors"]["truth"]["roll_deg"]["rms"]
+    haltere("run", log, "--out", "smooth")  # a later run without it takes the table away
+    assert not Path("smooth/smoothed.parquet").exists()

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 import pytest
 
@@ -78,3 +80,16 @@ def test_the_check_can_fail() -> None:
         solution = run(flight, set=lied, initial=_start(flight, np.random.default_rng([8, k])))
         values.append(float(nees_series(solution, flight["truth"])["velocity"][1].mean()))
     assert not low < np.mean(values) < high
+
+
+@pytest.mark.parametrize("estimator", ["navigator", "ahrs"])
+def test_a_heading_that_nothing_measures_stays_unknown(estimator: str) -> None:
+    """No compass, no GNSS: assumed velocities and positions are no measurement of heading, however the vehicle accelerates."""
+    worst = []
+    for seed in range(3, 9):
+        flight = demo_flight(seed=seed, duration=60.0, imu_rate=100.0).without("magnetometer", "gnss")
+        solution = run(flight, estimator)
+        assert solution["sd_yaw"].min() > math.radians(30.0)
+        error = np.radians(solution.summary["errors"]["truth"]["yaw_deg"]["rms"])
+        worst.append(error / float(np.median(solution["sd_yaw"])))
+    assert np.sqrt(np.mean(np.square(worst))) < 2.0

@@ -472,7 +472,6 @@ def test_wrong_keys_are_named(flight: FlightLog, key: str, value: Any, message: 
         ({"estimator": "ahrs", "set": {"aid.gnss": "on"}}, r"a key that ahrs has, found 'aid\.gnss'"),
         ({"rate": 0.0}, r"a positive number of rows a second, found 0\.0"),
         ({"rate": math.nan}, r"a positive number of rows a second, found nan"),
-        ({"smooth": True}, r"smooth"),
         ({"config": "no/such/file.toml"}, r"a configuration file, found no such file"),
     ],
 )

@@ -225,7 +225,7 @@ def test_rate_decimates_and_does_not_interpolate(flight: FlightLog, offline: hal
 
 
 def test_what_is_not_there_is_said(flight: FlightLog) -> None:
-    for option in ({"smooth": True}, {"vehicle": "x.toml"}, {"preset": "as-printed"}):
+    for option in ({"vehicle": "x.toml"}, {"preset": "as-printed"}):
         with pytest.raises(UsageError):
             run(flight, **option)  # type: ignore[arg-type]
     with pytest.raises(UsageError, match=r"did you mean 'gate\.gnss'"):

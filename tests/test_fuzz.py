@@ -256,6 +256,22 @@ def test_a_blackbox_log_of_which_no_frame_can_be_decoded_is_read_once(tmp_path: 
     assert taken < 2 * len(data)
 
 
+def test_a_blackbox_header_that_contradicts_its_frames(tmp_path: Path) -> None:
+    """The line with the names of the slow fields is lost, their values still stand in every frame."""
+    data = fuzz.made("blackbox")[0]["log.bbl"]
+    bad = data.replace(b"H Field S name:flightModeFlags,stateFlags\n", b"")
+    assert len(bad) < len(data)
+    _refused(fuzz.lay({"log.bbl": bad}, tmp_path), "as many as the header names")
+
+
+def test_blackbox_motor_range_that_is_no_number(tmp_path: Path) -> None:
+    data = fuzz.made("blackbox")[0]["log.bbl"]
+    bad = data.replace(b"motorOutput:48,2047", b"motorOutput:48,2x47")
+    assert bad != data
+    flight = read(fuzz.lay({"log.bbl": bad}, tmp_path))
+    assert any("no motorOutput range" in note for note in flight.notes)
+
+
 def test_a_home_that_is_no_place(tmp_path: Path) -> None:
     data = bytearray(fuzz.made("dataflash")[0]["log.bin"])
     kind = data[data.index(b"ORGN") - 2]

@@ -144,7 +144,9 @@ def test_gnss_velocity_row(seed: int) -> None:
     H = derivative(s, lambda x: predicted(gnss.offer_velocity(x, prm, m)), 16)
     np.testing.assert_allclose(dense(offer[5], 16), H, atol=1e-8)
     assert np.abs(H[:, BG]).max() > 0.1  # the antenna is off the centre
-    assert (offer[0], offer[1], offer[2], offer[6], offer[7], offer[9]) == (3, records.C_VEL, (1.0, 2.0, 3.0), 5.0, 7.0, False)
+    assert (offer[0], offer[1], offer[2], offer[6], offer[7], offer[9]) == (
+        3, records.C_VEL, (1.0, 2.0, 3.0), 5.0, 7.0, fusing.ANY_TURN,
+    )  # fmt: skip
 
 
 @pytest.mark.parametrize("seed", range(5))
@@ -328,7 +330,7 @@ def test_heading_offer(seed: int) -> None:
     offer = magnetometer.offer(s, prm, measurement(tup(truth.as_matrix().T @ field(s))), buffer())  # type: ignore[arg-type]
     assert offer[0] == 1
     assert offer[8] == records.R_NONE
-    assert offer[9]  # only the turn about the vertical is kept
+    assert offer[9] == fusing.ONLY_TURN  # only the turn about the vertical is kept
     e = offer[2][0] - offer[3][0]
     assert e == pytest.approx(levelled(estimate, truth, field(s), 0.05), abs=1e-12)
     row = levelled_row(estimate, field(s), 0.05)
@@ -348,7 +350,7 @@ def test_three_axes_row(seed: int) -> None:
     H = derivative(s, lambda x: predicted(magnetometer.offer(x, prm, m, buffer())), 16)
     np.testing.assert_allclose(dense(offer[5], 16), H, atol=1e-6)
     np.testing.assert_allclose(offer[4], 4.0)
-    assert (offer[0], offer[9]) == (3, False)
+    assert (offer[0], offer[9]) == (3, fusing.ANY_TURN)
 
 
 @pytest.mark.parametrize(

@@ -18,6 +18,7 @@ from haltere.estimators import step as kernels
 from haltere.estimators.base import InitialState, new_state
 from haltere.estimators.inputs import Measurements, configure, imu_arrays, measurements, parameters, request
 from haltere.estimators.registry import SPECIFICATIONS
+from haltere.estimators.smoother import node_width, smoothed
 from haltere.flight.config import Config
 from haltere.flight.corrections import correct
 from haltere.flight.door import Checked, check, fit
@@ -68,7 +69,7 @@ def run(
     vehicle
         Vehicle file. No estimator uses one yet.
     smooth
-        Run the smoother too. Not there yet.
+        Smooth the run too (fixed-interval): ``solution.smoothed``.
     rate
         Rows a second of the solution; decimates, does not interpolate.
     initial
@@ -90,8 +91,6 @@ def run(
     UsageError
         Unknown estimator, preset or key, or something asked for that is not there.
     """
-    if smooth:
-        raise UsageError("a filter run", "smooth=True", "run", "the smoother is not part of this version")
     if vehicle is not None:
         raise UsageError("no vehicle file", str(vehicle), "run", f"{estimator} does not use a vehicle model in this version")
     if rate is not None and not (math.isfinite(rate) and rate > 0.0):
@@ -109,7 +108,7 @@ def run(
 
     S, prm = new_state(resolved, initial), parameters(resolved)
     cov = np.empty((kernels.COVARIANCE_ROWS, min(int((t[-1] - t[0]) / 0.1), len(t)) + 64))
-    rows, aids_parts, events = _loop(S, prm, t, gyro, accel, offered, cov, progress)
+    rows, aids_parts, events, nodes = _loop(S, prm, t, gyro, accel, offered, cov, progress, smooth)
     filtered = time.perf_counter()
 
     n = rows.shape[1]
@@ -124,8 +123,19 @@ def run(
         keep = _decimate(table["t"], rate)
         table = {name: column[keep] for name, column in table.items()}
     solution = Solution(table, _aid_table(aids_parts), events, resolved, {}, _covariance(cov, int(S["n_cov"][0])))
+    facts = _facts(flight, checked, S, offered, n, t, began, prepared, filtered)
+    if smooth:
+        began = time.perf_counter()
+        back, back_cov, lost = smoothed(S, prm, rows, nodes, t, gyro, accel, solution.covariance["t"])
+        facts["timings"]["smooth_s"] = time.perf_counter() - began
+        table = _table(back, S, specification.POSITION)
+        if rate is not None:
+            table = {name: column[keep] for name, column in table.items()}
+        solution.smoothed = Solution(table, solution.aids, events, resolved, {}, _covariance(back_cov, back_cov.shape[1]))
+        if lost:
+            facts["warnings"].append(f"smoothed: {lost} times the covariance could not be inverted; what is before was smoothed by itself")
     shown = fit(flight, checked)
-    summarise(solution, shown, _facts(flight, checked, S, offered, n, t, began, prepared, filtered), scored)
+    summarise(solution, shown, facts, scored)
     for name, stream in flight.streams.items():  # as read, before anything was left out
         solution.summary["streams"][name]["n"] = len(stream)
     return solution
@@ -146,14 +156,20 @@ def _loop(
     m: Measurements,
     cov: FloatArray,
     progress: Callable[[float], None] | None,
-) -> tuple[FloatArray, list[NDArray[np.void]], list[dict[str, Any]]]:
-    """Drive the compiled step over the whole log, draining rows, records and events between chunks; rows come back as columns."""
+    smooth: bool,
+) -> tuple[FloatArray, list[NDArray[np.void]], list[dict[str, Any]], FloatArray]:
+    """Drive the compiled step over the whole log, draining rows, records and events between chunks; rows come back as columns.
+
+    The last of what comes back is the tape for smoothing, empty where none is wanted.
+    """
     width = int(kernels.row_width(S["baro"].shape[1]))
     columns = np.empty((width, len(t)))
     chunk = np.empty((CHUNK + 4 * IMU_CAPACITY, width))
     aids = as_records(np.empty(AID_ROOM, AID_RECORD))
     parts: list[NDArray[np.void]] = []
     events: list[dict[str, Any]] = []
+    tape = np.empty((len(chunk) if smooth else 0, node_width(S["P"].shape[1], S["baro"].shape[1])))
+    nodes: list[FloatArray] = []
     filled = 0
 
     def drain() -> None:
@@ -162,15 +178,17 @@ def _loop(
         columns[:, filled : filled + n] = chunk[:n].T
         filled += n
         S["n_rows"] = 0
+        nodes.append(tape[: int(S["n_nodes"][0])].copy())
+        S["n_nodes"] = 0
         _drain(S, aids, parts, events)
 
     i = j = 0
     while i < len(t) or S["imu_n"][0] > 0:
-        i, j = kernels.run_chunk(S, prm, t, gyro, accel, i, min(i + CHUNK, len(t)), m.kind, m.t, m.z, m.r, j, chunk, cov, aids)
+        i, j = kernels.run_chunk(S, prm, t, gyro, accel, i, min(i + CHUNK, len(t)), m.kind, m.t, m.z, m.r, j, chunk, cov, aids, tape)
         drain()
         if progress is not None:
             progress(i / len(t))
-    return columns[:, :filled], parts, events
+    return columns[:, :filled], parts, events, np.concatenate(nodes) if nodes else tape
 
 
 def _drain(S: NDArray[np.void], aids: NDArray[np.void], parts: list[NDArray[np.void]], events: list[dict[str, Any]]) -> None:

@@ -5,8 +5,8 @@ from __future__ import annotations
 from typing import Any
 
 from haltere._jit import jit
-from haltere.aids.fusing import NO_GATE, NO_TIMEOUT, THREE, ZEROS, Offer, unit_rows
-from haltere.aids.record import C_POS, C_VEL, GNSS_POSITION, R_NONE
+from haltere.aids.fusing import ANY_TURN, NO_GATE, NO_TIMEOUT, NO_TURN, THREE, ZEROS, Offer, unit_rows
+from haltere.aids.record import C_POS, C_VEL, GNSS_POSITION, MAGNETOMETER, R_NONE
 from haltere.strapdown.layout import POS, VEL
 
 __all__ = ["offer_position", "offer_velocity", "position_is_lost"]
@@ -21,16 +21,27 @@ def position_is_lost(s: Any) -> bool:
 
 
 @jit
+def turn_allowed(s: Any, prm: Any) -> int:
+    """Whether an assumption may turn the heading: only while a compass holds it.
+
+    An assumed velocity is wrong for longer than a filter believes, and its error is correlated with the heading's under every
+    acceleration: a heading that nothing measures would soon be taken for known.
+    """
+    a = s.aid[MAGNETOMETER]
+    return ANY_TURN if a.started > 0 and s.t - a.t_passed < prm.timeout_magnetometer else NO_TURN
+
+
+@jit
 def offer_position(s: Any, prm: Any, resting: bool) -> Offer:
     """Position stays where it last was: 1σ ``noise.fake_position`` in flight, ``noise.fake_position_rest`` at rest, no gate."""
     sd = prm.noise_fake_position_rest if resting else prm.noise_fake_position
     r = sd * sd
     z, h = (s.anchor[0], s.anchor[1], s.anchor[2]), (s.p[0], s.p[1], s.p[2])
-    return THREE, C_POS, z, h, (r, r, r), unit_rows(POS), NO_GATE, NO_TIMEOUT, R_NONE, False
+    return THREE, C_POS, z, h, (r, r, r), unit_rows(POS), NO_GATE, NO_TIMEOUT, R_NONE, turn_allowed(s, prm)
 
 
 @jit
 def offer_velocity(s: Any, prm: Any) -> Offer:
     """Velocity is zero within ``noise.fake_velocity``: what attitude alone knows of where down is (theory-amendments.md §8)."""
     r = prm.noise_fake_velocity * prm.noise_fake_velocity
-    return THREE, C_VEL, ZEROS, (s.v[0], s.v[1], s.v[2]), (r, r, r), unit_rows(VEL), NO_GATE, NO_TIMEOUT, R_NONE, False
+    return THREE, C_VEL, ZEROS, (s.v[0], s.v[1], s.v[2]), (r, r, r), unit_rows(VEL), NO_GATE, NO_TIMEOUT, R_NONE, turn_allowed(s, prm)

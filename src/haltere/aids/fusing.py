@@ -24,12 +24,27 @@ from haltere.filter.gates import ABSENT, inflation, joint_nis, optimal_gain
 from haltere.filter.update import NONE, Row, apply, innovation, project, variance
 from haltere.strapdown.propagate import inject
 
-__all__ = ["DISTRUSTED", "NOTHING", "NO_GATE", "NO_TIMEOUT", "Offer", "fuse_offer", "judge", "unit_rows"]
+__all__ = [
+    "ANY_TURN",
+    "DISTRUSTED",
+    "NOTHING",
+    "NO_GATE",
+    "NO_TIMEOUT",
+    "NO_TURN",
+    "ONLY_TURN",
+    "Offer",
+    "fuse_offer",
+    "judge",
+    "unit_rows",
+]
 
 #: What an aid has to say of one measurement, the same shape for all, so that one machine-code version fuses them all:
 #: number of components (0: nothing to fuse), code of the first, observations z, their predictions h, variances r, rows of H,
-#: gate [sigma], timeout [s], reason to refuse it whatever the test says, and whether only the turn about the vertical is kept.
-Offer = tuple[int, int, Vec, Vec, Vec, tuple[Row, Row, Row], float, float, int, bool]
+#: gate [sigma], timeout [s], reason to refuse it whatever the test says, and what it may do to the turn about the vertical.
+Offer = tuple[int, int, Vec, Vec, Vec, tuple[Row, Row, Row], float, float, int, int]
+
+#: The gain as it is, only its turn about the vertical, or all but that.
+ANY_TURN, ONLY_TURN, NO_TURN = (constant(i) for i in (0, 1, 2))
 
 NO_GATE, NO_TIMEOUT = 1e9, 1e18
 #: What ``started`` says of a sensor.
@@ -39,7 +54,7 @@ PROBATION = 10.0
 ZERO, ONE, THREE = (constant(i) for i in (0, 1, 3))
 ZEROS = (0.0, 0.0, 0.0)
 #: An offer of nothing.
-NOTHING = (ZERO, ZERO, ZEROS, ZEROS, ZEROS, ((NONE, NONE, NONE), (NONE, NONE, NONE), (NONE, NONE, NONE)), 1.0, 1.0, ZERO, False)
+NOTHING = (ZERO, ZERO, ZEROS, ZEROS, ZEROS, ((NONE, NONE, NONE), (NONE, NONE, NONE), (NONE, NONE, NONE)), 1.0, 1.0, ZERO, ANY_TURN)
 
 
 @jit
@@ -103,7 +118,7 @@ def fuse_offer(s: Any, aids: Any, t: float, sensor: int, offer: Offer) -> None:
     offer
         What the aid has to say, see `Offer`.
     """
-    n, component, z, h, r, H, gate, timeout, reason, vertical = offer
+    n, component, z, h, r, H, gate, timeout, reason, turn = offer
     if n == 0:
         return
     H0, H1, H2 = H
@@ -129,8 +144,8 @@ def fuse_offer(s: Any, aids: Any, t: float, sensor: int, offer: Offer) -> None:
                 row, r_i, e_i, ok = H2, r[2], e[2], ok2
             if ok:
                 optimal_gain(s, row, r_i)
-                if vertical:
-                    project_gain(s)
+                if turn != ANY_TURN:
+                    project_gain(s, turn == ONLY_TURN)
                 apply(s, row, r_i, innovation(s, row, e_i))
         inject(s)
     for i in range(n):
@@ -139,17 +154,23 @@ def fuse_offer(s: Any, aids: Any, t: float, sensor: int, offer: Offer) -> None:
 
 
 @jit
-def project_gain(s: Any) -> None:
-    """Keep of the gain in ``s.k`` only what turns about the vertical: K_θ <- d (dᵀ K_θ), K_bg likewise, the rest zero.
+def project_gain(s: Any, only: bool) -> None:
+    """Keep of the gain in ``s.k`` only what turns about the vertical, or all but that.
 
-    d = Cᵀ e3 is the vertical in the body frame (theory-amendments.md §1).
+    Only: K_θ <- d (dᵀ K_θ), K_bg likewise, the rest zero; else K_θ <- K_θ - d (dᵀ K_θ), K_bg likewise. d = Cᵀ e3 is the vertical in the
+    body frame (theory-amendments.md §1).
     """
     d = dcm((s.q[0], s.q[1], s.q[2], s.q[3]))[2]
     k = s.k
     a = d[0] * k[0] + d[1] * k[1] + d[2] * k[2]
     b = d[0] * k[9] + d[1] * k[10] + d[2] * k[11]
-    for i in range(s.P.shape[0]):
-        k[i] = 0.0
+    if only:
+        for i in range(s.P.shape[0]):
+            k[i] = 0.0
+        for i in range(3):
+            k[i] = a * d[i]
+            k[9 + i] = b * d[i]
+        return
     for i in range(3):
-        k[i] = a * d[i]
-        k[9 + i] = b * d[i]
+        k[i] -= a * d[i]
+        k[9 + i] -= b * d[i]

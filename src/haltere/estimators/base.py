@@ -219,7 +219,7 @@ class Estimator:
         """
         kernels.step(
             self._S, self._prm, _number(t, "t", "Estimator.step"), _three(gyro, "gyro"), _three(accel, "accel"),
-            _NO_ROWS, _NO_ROWS, self._aids,
+            _NO_ROWS, _NO_ROWS, self._aids, _NO_ROWS,
         )  # fmt: skip
         return self._view
 
@@ -336,7 +336,7 @@ class Estimator:
 
     def finish(self) -> State:
         """Move the fusion horizon to the newest IMU sample: the end of a flight."""
-        kernels.flush(self._S, self._prm, _NO_ROWS, _NO_ROWS, self._aids)
+        kernels.flush(self._S, self._prm, _NO_ROWS, _NO_ROWS, self._aids, _NO_ROWS)
         return self._view
 
     def records(self) -> NDArray[np.void]:

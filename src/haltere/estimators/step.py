@@ -23,12 +23,29 @@ from haltere.estimators import alignment, yaw_bank
 from haltere.filter.queue import pop_imu, push, push_imu
 from haltere.strapdown.propagate import predict
 
-__all__ = ["COVARIANCE_ROWS", "advance", "flush", "now", "offer", "row_width", "run_chunk", "step"]
+__all__ = [
+    "COVARIANCE_ROWS",
+    "LONG_STEP",
+    "NODE_SPAN",
+    "NODE_STEPS",
+    "SUB_STEP",
+    "advance",
+    "bridge_push",
+    "flush",
+    "interval",
+    "now",
+    "offer",
+    "row_width",
+    "run_chunk",
+    "step",
+]
 
 #: Rows of the covariance output: time, the upper triangles of the five core blocks, the variance of the barometer offset.
 COVARIANCE_ROWS = 1 + 5 * 6 + 1
 #: Longest interval [s] bridged in one step, and longest gap [s] bridged at all.
 LONG_STEP, SUB_STEP = 0.1, 0.05
+#: A tape for smoothing has a node after each fusion, at least after so many predictions, and about every so many seconds.
+NODE_STEPS, NODE_SPAN = 64, 0.05
 #: No sensor measures more [rad/s, m/s^2].
 RATE_MAX, FORCE_MAX = 100.0, 500.0
 
@@ -91,6 +108,30 @@ def write_covariance(s: Any, prm: Any, cov: Any) -> None:
 
 
 @jit
+def write_node(s: Any, tape: Any, begins: bool) -> None:
+    """Append a posterior to the tape for smoothing, where there is one: see `haltere.estimators.smoother.load_node`."""
+    i = s.n_nodes
+    if i >= tape.shape[0]:
+        return
+    node = tape[i]
+    node[0], node[1], node[2] = s.t, 1.0 if begins else 0.0, s.gravity
+    for j in range(4):
+        node[3 + j] = s.q[j]
+    for j in range(3):
+        node[7 + j], node[10 + j], node[13 + j], node[16 + j] = s.v[j], s.p[j], s.bg[j], s.ba[j]
+    k = 19
+    for j in range(len(s.baro)):
+        node[k] = s.baro[j]
+        k += 1
+    for r in range(s.P.shape[0]):
+        for c in range(r, s.P.shape[0]):
+            node[k] = s.P[r, c]
+            k += 1
+    s.n_nodes = i + 1
+    s.n_since = 0
+
+
+@jit
 def sound(s: Any) -> bool:
     """Whether state and covariance are finite and every variance positive."""
     total = s.q[0] + s.q[1] + s.q[2] + s.q[3]
@@ -105,8 +146,8 @@ def sound(s: Any) -> bool:
 
 
 @jit
-def predict_interval(s: Any, prm: Any, w0: Vec, f0: Vec, w1: Vec, f1: Vec, dt: float) -> None:
-    """Predict over one interval between IMU samples (w0, f0) and (w1, f1), raw.
+def interval(s: Any, prm: Any, w0: Vec, f0: Vec, w1: Vec, f1: Vec, dt: float) -> tuple[Vec, Vec, Vec, Vec]:
+    """Mean rate and force, rotation vector and velocity increment of one interval between IMU samples (w0, f0) and (w1, f1), raw.
 
     Samples are values at their times (then coning and sculling of a linear course are kept), or means since the one before.
     """
@@ -114,8 +155,7 @@ def predict_interval(s: Any, prm: Any, w0: Vec, f0: Vec, w1: Vec, f1: Vec, dt: f
     b = (w1[0] - bg[0], w1[1] - bg[1], w1[2] - bg[2])
     g = (f1[0] - ba[0], f1[1] - ba[1], f1[2] - ba[2])
     if prm.imu_mean > 0.0:
-        predict(s, prm, b, g, (b[0] * dt, b[1] * dt, b[2] * dt), (g[0] * dt, g[1] * dt, g[2] * dt), dt)
-        return
+        return b, g, (b[0] * dt, b[1] * dt, b[2] * dt), (g[0] * dt, g[1] * dt, g[2] * dt)
     a = (w0[0] - bg[0], w0[1] - bg[1], w0[2] - bg[2])
     h = (f0[0] - ba[0], f0[1] - ba[1], f0[2] - ba[2])
     w = (0.5 * (a[0] + b[0]), 0.5 * (a[1] + b[1]), 0.5 * (a[2] + b[2]))
@@ -123,15 +163,29 @@ def predict_interval(s: Any, prm: Any, w0: Vec, f0: Vec, w1: Vec, f1: Vec, dt: f
     k = dt * dt / 12.0
     coning = cross(a, b)
     s1, s2 = cross(a, g), cross(h, b)
-    predict(
-        s,
-        prm,
+    return (
         w,
         f,
         (w[0] * dt + k * coning[0], w[1] * dt + k * coning[1], w[2] * dt + k * coning[2]),
         (f[0] * dt + k * (s1[0] + s2[0]), f[1] * dt + k * (s1[1] + s2[1]), f[2] * dt + k * (s1[2] + s2[2])),
-        dt,
     )
+
+
+@jit
+def predict_interval(s: Any, prm: Any, w0: Vec, f0: Vec, w1: Vec, f1: Vec, dt: float) -> None:
+    """Predict over one interval between raw IMU samples, see `interval`."""
+    w, f, rotation, dv = interval(s, prm, w0, f0, w1, f1, dt)
+    predict(s, prm, w, f, rotation, dv, dt)
+
+
+@jit
+def bridge_push(s: Any, dt: float) -> None:
+    """Admit that nobody knows what happened in ``dt`` seconds without samples."""
+    turn, push_v, push_p = 0.5 * dt, 3.0 * dt, 1.5 * dt * dt
+    for i in range(3):
+        s.P[i, i] += turn * turn
+        s.P[3 + i, 3 + i] += push_v * push_v
+        s.P[6 + i, 6 + i] += push_p * push_p
 
 
 @jit
@@ -150,17 +204,13 @@ def bridge_gap(s: Any, prm: Any, w0: Vec, f0: Vec, w1: Vec, f1: Vec, dt: float) 
             (f0[0] + k1 * (f1[0] - f0[0]), f0[1] + k1 * (f1[1] - f0[1]), f0[2] + k1 * (f1[2] - f0[2])),
             h,
         )
-    turn, push_v, push_p = 0.5 * dt, 3.0 * dt, 1.5 * dt * dt
-    for i in range(3):
-        s.P[i, i] += turn * turn
-        s.P[3 + i, 3 + i] += push_v * push_v
-        s.P[6 + i, 6 + i] += push_p * push_p
+    bridge_push(s, dt)
     event(s, s.t, E_GAP, NO_SENSOR, dt)
     s.n_gaps += 1
 
 
 @jit
-def advance(s: Any, prm: Any, rows: Any, cov: Any, aids: Any) -> None:
+def advance(s: Any, prm: Any, rows: Any, cov: Any, aids: Any, tape: Any) -> None:
     """Move the fusion horizon over the oldest queued IMU sample."""
     m = s.imu[s.imu_head]
     t = m.t
@@ -179,6 +229,7 @@ def advance(s: Any, prm: Any, rows: Any, cov: Any, aids: Any) -> None:
         s.t = t
         write_row(s, rows)
         write_covariance(s, prm, cov)
+        write_node(s, tape, True)
         return
     if dt > prm.timeout_imu:  # too long to bridge: align anew
         event(s, t, E_GAP, NO_SENSOR, dt)
@@ -204,7 +255,10 @@ def advance(s: Any, prm: Any, rows: Any, cov: Any, aids: Any) -> None:
             s.n_unaligned += 1
             return
         s.t_covariance = t
+        begins, node = True, True
     else:
+        begins, node = False, dt > LONG_STEP or t >= s.t_wake or s.n_since >= NODE_STEPS - 1 or s.n_since * dt >= NODE_SPAN
+        s.n_since += 1
         north, east = s.v[0], s.v[1]
         if dt > LONG_STEP:
             bridge_gap(s, prm, w0, f0, w1, f1, dt)
@@ -225,6 +279,8 @@ def advance(s: Any, prm: Any, rows: Any, cov: Any, aids: Any) -> None:
         return
     write_row(s, rows)
     write_covariance(s, prm, cov)
+    if node:
+        write_node(s, tape, begins)
 
 
 @jit
@@ -258,7 +314,7 @@ def behind(s: Any, prm: Any) -> bool:
 
 
 @entry
-def step(S: Any, PRM: Any, t: float, gyro: Vec, accel: Vec, rows: Any, cov: Any, aids: Any) -> int:
+def step(S: Any, PRM: Any, t: float, gyro: Vec, accel: Vec, rows: Any, cov: Any, aids: Any, tape: Any) -> int:
     """Take one IMU sample, and move the horizon as far as ``horizon`` behind it.
 
     Parameters
@@ -269,7 +325,7 @@ def step(S: Any, PRM: Any, t: float, gyro: Vec, accel: Vec, rows: Any, cov: Any,
         Time stamp [s].
     gyro, accel
         Angular rate [rad/s] and specific force [m/s^2], body frame.
-    rows, cov, aids
+    rows, cov, aids, tape
         Output arrays; their fill is counted in the state. Arrays without room are left alone.
 
     Returns
@@ -280,16 +336,16 @@ def step(S: Any, PRM: Any, t: float, gyro: Vec, accel: Vec, rows: Any, cov: Any,
     s, prm = S[0], PRM[0]
     status = take(s, t, gyro, accel)
     while behind(s, prm):
-        advance(s, prm, rows, cov, aids)
+        advance(s, prm, rows, cov, aids, tape)
     return status
 
 
 @entry
-def flush(S: Any, PRM: Any, rows: Any, cov: Any, aids: Any) -> None:
+def flush(S: Any, PRM: Any, rows: Any, cov: Any, aids: Any, tape: Any) -> None:
     """Move the horizon to the newest IMU sample: the end of a log."""
     s, prm = S[0], PRM[0]
     while s.imu_n > 0:
-        advance(s, prm, rows, cov, aids)
+        advance(s, prm, rows, cov, aids, tape)
 
 
 @entry
@@ -327,6 +383,7 @@ def run_chunk(
     rows: Any,
     cov: Any,
     aids: Any,
+    tape: Any,
 ) -> tuple[int, int]:
     """Do what `offer` and `step` do, over IMU samples i ... i_end - 1 and the measurements stamped at or before them.
 
@@ -350,7 +407,7 @@ def run_chunk(
     s, prm = S[0], PRM[0]
     while s.n_aids <= len(aids) - 2048 and s.n_events <= len(s.event) - 8 and s.n_rows <= rows.shape[0] - 2 * len(s.imu):
         if behind(s, prm) or (i == len(t) and s.imu_n > 0):  # the one call of `advance` here: with a second one it is compiled twice
-            advance(s, prm, rows, cov, aids)
+            advance(s, prm, rows, cov, aids, tape)
         elif i < i_end:
             while j < len(stamps) and stamps[j] <= t[i]:
                 offer(S, PRM, kinds[j], stamps[j], (z[j, 0], z[j, 1], z[j, 2]), (r[j, 0], r[j, 1], r[j, 2]))

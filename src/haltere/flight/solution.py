@@ -44,6 +44,8 @@ class Solution:
     covariance
         ``t`` (m,) and the 3x3 blocks ``attitude, velocity, position, gyro_bias, accel_bias`` (m, 3, 3) and ``baro_bias`` (m, 1, 1)
         at times spaced by at least 0.1 s, for consistency statistics. The attitude block is of the body-frame rotation error.
+    smoothed
+        The same rows smoothed over the whole run, where that was asked for; ``smoothed.parquet``.
     """
 
     table: dict[str, FloatArray]
@@ -52,6 +54,7 @@ class Solution:
     config: Config
     summary: dict[str, Any] = field(default_factory=dict)
     covariance: dict[str, FloatArray] = field(default_factory=dict)
+    smoothed: Solution | None = None
 
     @property
     def t(self) -> FloatArray:
@@ -99,8 +102,11 @@ class Solution:
         import polars as pl
 
         folder = Path(folder)
-        with whole_files(folder, SUMMARY, [name for name in FILES if name not in (extra or {})]) as work:
+        made = {*(extra or {}), *(["smoothed.parquet"] if self.smoothed is not None else [])}
+        with whole_files(folder, SUMMARY, [name for name in FILES if name not in made]) as work:
             self.to_polars().write_parquet(work / "solution.parquet")
+            if self.smoothed is not None:
+                self.smoothed.to_polars().write_parquet(work / "smoothed.parquet")
             pl.DataFrame(dict(self.aids)).write_parquet(work / "aids.parquet")
             (work / "events.json").write_text(_json(self.events), encoding="utf-8")
             (work / SUMMARY).write_text(_json(self.summary), encoding="utf-8")

@@ -94,6 +94,7 @@ def _blocks(t: FloatArray, x: FloatArray, width: float, start: float) -> tuple[F
         return sums / n[:, None], n
 
 
+@np.errstate(over="ignore")  # samples near the end of the range are damaged ones, and move
 def flying(flight: FlightLog, *, gyro: float = 0.02, accel: float = 0.3) -> tuple[FloatArray, Mask, Mask]:
     """Times of the IMU, and which are of the vehicle in motion and at rest: the nearest thing to "in flight" that every log tells.
 

@@ -49,6 +49,7 @@ def finite(value: Any) -> Any:
     return value
 
 
+@np.errstate(all="ignore")  # what is near the end of the range is a damaged sample, and shows as such
 def summarise(solution: Solution, flight: FlightLog, facts: dict[str, Any], scored: bool = True) -> None:
     """Fill ``solution.summary`` from the solution, the flight it is of, and what the run knows.
 
@@ -77,6 +78,12 @@ def summarise(solution: Solution, flight: FlightLog, facts: dict[str, Any], scor
     summary["nis"] = nis_table(solution)
     summary["whiteness"] = whiteness_table(whiteness_series(solution))
     summary["nees"] = nees_table(nees_series(solution, flight["truth"])) if "truth" in references else {}
+    if solution.smoothed is not None:
+        solution.smoothed.summary["origin"] = facts["origin"]
+        summary["smoothed"] = {
+            "errors": {name: error_table(error_series(solution.smoothed, flight[name])) for name in references},
+            "nees": nees_table(nees_series(solution.smoothed, flight["truth"])) if "truth" in references else {},
+        }
     summary["health"] = _health(solution, flight)
     summary["sensors"] = sensor_table(solution, flight) if scored else {}
     summary["findings"] = findings(summary["sensors"])

@@ -80,6 +80,8 @@ class Session:
             rows = _Frames(parser, *at, self.headers)
             table = list(rows)
         self.names = names
+        if bad := {len(row) for row in table} - {len(names)}:
+            raise unusable(path, f"frames of {len(names)} fields, as many as the header names", " or ".join(map(str, sorted(bad))))
         missing = _missing([row[at[0]] for row in table])
         builder.discard("imu", "frames damaged, not to be decoded, or never written", max(missing, rows.damaged))
         if rows.cut:

@@ -164,7 +164,7 @@ def _add_rotors(session: Session, builder: Builder) -> None:
         if np.nan_to_num(speed).any():
             columns[f"speed_{i}"] = speed
     ends = session.headers.get("motorOutput")
-    if isinstance(ends, list) and len(ends) == 2 and ends[1] > ends[0]:
+    if isinstance(ends, list) and len(ends) == 2 and all(isinstance(e, int) for e in ends) and ends[1] > ends[0]:
         for i in motors:
             columns[f"command_{i}"] = np.clip((session.get(f"motor[{i}]") - ends[0]) / (ends[1] - ends[0]), 0.0, 1.0)
     elif motors:

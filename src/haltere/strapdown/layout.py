@@ -201,6 +201,8 @@ def layout(baro: int = 0) -> np.dtype[np.void]:
             ("n_bad", "i8"),
             ("n_ring_full", "i8"),
             ("n_rows", "i8"),
+            ("n_nodes", "i8"),
+            ("n_since", "i8"),
             ("n_cov", "i8"),
             ("n_aids", "i8"),
             ("n_aids_lost", "i8"),

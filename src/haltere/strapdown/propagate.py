@@ -11,7 +11,7 @@ from haltere._jit import jit
 from haltere.core.rotation import Mat, Vec, cross, dcm, dot, mat_vec, quat_from_rotvec, quat_mul, quat_unit, rotvec_dcm
 from haltere.filter.update import symmetrise
 
-__all__ = ["inject", "left_F", "mechanise", "predict", "turn"]
+__all__ = ["inject", "left_F", "mechanise", "predict", "propagate", "transition", "turn"]
 
 
 @jit
@@ -46,6 +46,35 @@ def mechanise(s: Any, rotation: Vec, dv_mid: Vec, dt: float) -> Mat:
 
 
 @jit
+def transition(C: Mat, rotation: Vec, f: Vec, dt: float) -> tuple[Mat, Mat, Mat]:
+    """Blocks of Φ that are not zero or one (theory-amendments.md §8): Φ_θθ = R(ω dt)ᵀ, Φ_vθ = -C [f]× dt and Φ_v,ba = -C dt.
+
+    Parameters
+    ----------
+    C
+        C_nb in the middle of the interval.
+    rotation, f
+        Rotation vector and mean specific force of the interval, bias removed [rad, m/s^2].
+    dt
+        Interval [s].
+    """
+    D = rotvec_dcm((-rotation[0], -rotation[1], -rotation[2]))
+    # -C [f]x: column j is -C (f x e_j)
+    fx, fy, fz = dt * f[0], dt * f[1], dt * f[2]
+    A = (
+        (C[0][2] * fy - C[0][1] * fz, C[0][0] * fz - C[0][2] * fx, C[0][1] * fx - C[0][0] * fy),
+        (C[1][2] * fy - C[1][1] * fz, C[1][0] * fz - C[1][2] * fx, C[1][1] * fx - C[1][0] * fy),
+        (C[2][2] * fy - C[2][1] * fz, C[2][0] * fz - C[2][2] * fx, C[2][1] * fx - C[2][0] * fy),
+    )
+    B = (
+        (-dt * C[0][0], -dt * C[0][1], -dt * C[0][2]),
+        (-dt * C[1][0], -dt * C[1][1], -dt * C[1][2]),
+        (-dt * C[2][0], -dt * C[2][1], -dt * C[2][2]),
+    )
+    return D, A, B
+
+
+@jit
 def left_F(s: Any, j: int, D: Mat, A: Mat, B: Mat, dt: float) -> None:
     """Column j of P <- Φ P, touching only the blocks of Φ that are not zero or one.
 
@@ -53,10 +82,8 @@ def left_F(s: Any, j: int, D: Mat, A: Mat, B: Mat, dt: float) -> None:
     ----------
     j
         Column. The loop over it is the caller's: with a length known there it becomes SIMD.
-    D
-        Φ_θθ = R(ω dt)ᵀ.
-    A, B
-        Φ_vθ = -C [f]× dt and Φ_v,ba = -C dt.
+    D, A, B
+        Blocks of Φ, see `transition`.
     dt
         Interval [s].
     """
@@ -110,24 +137,30 @@ def predict(s: Any, prm: Any, w: Vec, f: Vec, rotation: Vec, dv_mid: Vec, dt: fl
     """
     C = mechanise(s, rotation, dv_mid, dt)
     s.w[0], s.w[1], s.w[2] = w
-    Dt = rotvec_dcm((-rotation[0], -rotation[1], -rotation[2]))
-    # -C [f]x: column j is -C (f x e_j)
-    fx, fy, fz = dt * f[0], dt * f[1], dt * f[2]
-    A = (
-        (C[0][2] * fy - C[0][1] * fz, C[0][0] * fz - C[0][2] * fx, C[0][1] * fx - C[0][0] * fy),
-        (C[1][2] * fy - C[1][1] * fz, C[1][0] * fz - C[1][2] * fx, C[1][1] * fx - C[1][0] * fy),
-        (C[2][2] * fy - C[2][1] * fz, C[2][0] * fz - C[2][2] * fx, C[2][1] * fx - C[2][0] * fy),
-    )
-    B = (
-        (-dt * C[0][0], -dt * C[0][1], -dt * C[0][2]),
-        (-dt * C[1][0], -dt * C[1][1], -dt * C[1][2]),
-        (-dt * C[2][0], -dt * C[2][1], -dt * C[2][2]),
-    )
+    D, A, B = transition(C, rotation, f, dt)
+    propagate(s, prm, C, D, A, B, dt)
+
+
+@jit
+def propagate(s: Any, prm: Any, C: Mat, D: Mat, A: Mat, B: Mat, dt: float) -> None:
+    """P <- Φ P Φᵀ + Q.
+
+    Parameters
+    ----------
+    s, prm
+        State and parameter records.
+    C
+        C_nb in the middle of the interval.
+    D, A, B
+        Blocks of Φ, see `transition`.
+    dt
+        Interval [s].
+    """
     for j in range(s.P.shape[0]):
-        left_F(s, j, Dt, A, B, dt)
+        left_F(s, j, D, A, B, dt)
     turn(s)
     for j in range(9):
-        left_F(s, j, Dt, A, B, dt)
+        left_F(s, j, D, A, B, dt)
 
     P = s.P
     qg, qbg = prm.noise_gyro * prm.noise_gyro, prm.noise_gyro_bias * prm.noise_gyro_bias
