@@ -66,7 +66,9 @@ def filter_run(estimator: str, flight: twin.Flight) -> Run:
         began = common.clock()
         i = j = 0
         while i < n or S["imu_n"][0] > 0:
-            i, j = kernels.run_chunk(S, prm, flight.t, flight.gyro, flight.accel, i, n, kind, stamp, z, r, j, rows, cov, aids, np.empty((0, 0)))
+            i, j = kernels.run_chunk(
+                S, prm, flight.t, flight.gyro, flight.accel, i, n, kind, stamp, z, r, j, rows, cov, aids, np.empty((0, 0))
+            )
             S["n_aids"] = S["n_events"] = 0
         seconds = common.clock() - began
         if int(S["n_rows"][0]) != n:

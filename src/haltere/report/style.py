@@ -9,7 +9,7 @@ __all__ = ["AXES", "COLOURS", "MODES", "OTHERS", "PEERS", "SENSOR_COLOURS", "col
 #: Colour of each thing as (light, dark). Figures name things (``@estimate``, ``@estimate/0.2`` with opacity), never colours.
 COLOURS: dict[str, tuple[str, str]] = {
     "estimate": ("#1f6fd0", "#6aabff"),
-    "smoothed": ("#7a2fd6", "#b794ff"),
+    "smoothed": ("#8a4630", "#dca08a"),
     "truth": ("#16181c", "#f0f1f3"),
     "onboard": ("#d0700a", "#ffa14a"),
     "gnss": ("#23863a", "#57c873"),
