@@ -123,6 +123,7 @@ def run(
         keep = _decimate(table["t"], rate)
         table = {name: column[keep] for name, column in table.items()}
     solution = Solution(table, _aid_table(aids_parts), events, resolved, {}, _covariance(cov, int(S["n_cov"][0])))
+    shown = fit(flight, checked)  # counts what it leaves out: before the facts are gathered
     facts = _facts(flight, checked, S, offered, n, t, began, prepared, filtered)
     if smooth:
         began = time.perf_counter()
@@ -134,7 +135,6 @@ def run(
         solution.smoothed = Solution(table, solution.aids, events, resolved, {}, _covariance(back_cov, back_cov.shape[1]))
         if lost:
             facts["warnings"].append(f"smoothed: {lost} times the covariance could not be inverted; what is before was smoothed by itself")
-    shown = fit(flight, checked)
     summarise(solution, shown, facts, scored)
     for name, stream in flight.streams.items():  # as read, before anything was left out
         solution.summary["streams"][name]["n"] = len(stream)

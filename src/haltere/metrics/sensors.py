@@ -84,14 +84,16 @@ def sampling(t: FloatArray) -> dict[str, float | None]:
     }  # fmt: skip
 
 
-def _blocks(t: FloatArray, x: FloatArray, width: float, start: float) -> tuple[FloatArray, FloatArray]:
-    """Means of x (n, k) over blocks of ``width`` seconds from ``start``, NaN where a block is empty, and the samples of each."""
-    slot = np.floor((t - start) / width).astype(np.int64)
-    size = int(slot[-1]) + 1 if len(slot) else 0
-    n = np.bincount(slot, minlength=size).astype(np.float64)
-    sums = np.column_stack([np.bincount(slot, column, size) for column in x.T])
-    with np.errstate(invalid="ignore", divide="ignore"):
-        return sums / n[:, None], n
+def _blocks(t: FloatArray, x: FloatArray, width: float, start: float) -> tuple[FloatArray, FloatArray, NDArray[np.intp], FloatArray]:
+    """Means of x (n, k) over the blocks of ``width`` seconds from ``start`` that hold samples.
+
+    Returns the means, the samples of each, the row of the block that each sample is in, and the blocks' numbers. Blocks without samples are
+    left out: one damaged time can put years between two samples.
+    """
+    number, row = np.unique(np.floor((t - start) / width), return_inverse=True)
+    n = np.bincount(row, minlength=len(number)).astype(np.float64)
+    sums = np.column_stack([np.bincount(row, column, len(number)) for column in x.T])
+    return sums / n[:, None], n, row, number
 
 
 @np.errstate(over="ignore")  # samples near the end of the range are damaged ones, and move
@@ -106,11 +108,10 @@ def flying(flight: FlightLog, *, gyro: float = 0.02, accel: float = 0.3) -> tupl
     t, x = clean(imu.t, x)
     if len(t) < 8:
         return t, np.zeros(len(t), bool), np.zeros(len(t), bool)
-    mean, n = _blocks(t, x, 1.0, float(t[0]))
-    slot = np.floor(t - t[0]).astype(np.int64)
-    var, _ = _blocks(t, (x - mean[slot]) ** 2, 1.0, float(t[0]))
+    mean, n, row, _ = _blocks(t, x, 1.0, float(t[0]))
+    var, *_ = _blocks(t, (x - mean[row]) ** 2, 1.0, float(t[0]))
     moves = (np.nan_to_num(var) > np.r_[np.full(3, gyro**2), accel**2]).any(axis=1) & (n > 2)
-    still = np.asarray(~moves[slot])
+    still = np.asarray(~moves[row])
     moving = ~still
     modes = flight.get("modes")
     if modes is not None and np.any(modes.get("armed") == 1.0):
@@ -304,11 +305,11 @@ def differences(flight: FlightLog, stream: str, stem: str, width: float = 5.0) -
     # Blocks count only the slower unit's times: a fast unit is interpolated to them, so that both means are of the same moments.
     t, fast_t, fast, slow, sign = (tb, ta, a, b, 1.0) if len(tb) <= len(ta) else (ta, tb, b, a, -1.0)
     delta = sign * (slow - np.column_stack([np.interp(t, fast_t, c) for c in fast.T]))
-    mean, n = _blocks(t, delta, width, start)
+    mean, n, _, number = _blocks(t, delta, width, start)
     good = n >= 3
     if not good.any():
         return None
-    return start + width * (np.flatnonzero(good) + 0.5), mean[good]
+    return start + width * (number[good] + 0.5), mean[good]
 
 
 # --- everything together -------------------------------------------------------------------------------------------------
