@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import numpy as np
+
 from haltere.flight.log import FlightLog
 from haltere.flight.solution import Solution
 from haltere.report import overview, sections, tables
@@ -20,6 +22,7 @@ __all__ = ["page"]
 SENTENCES = 6
 
 
+@np.errstate(all="ignore")  # what is near the end of the range is a damaged sample, and shows as such
 def page(solution: Solution, flight: FlightLog, command: str | None = None) -> str:
     """A report on a solution as one HTML page that loads nothing from outside.
 
