@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 from haltere._jit import jit
-from haltere.aids.fusing import ANY_TURN, NOTHING, ONE, RUNNING, Offer
+from haltere.aids.fusing import ANY_TURN, HARD, NOTHING, ONE, RUNNING, Offer
 from haltere.aids.record import BAROMETER, C_ALTITUDE, FUSED, R_NONE, R_START, record
 from haltere.filter.update import NONE
 from haltere.strapdown.layout import LAST, POS
@@ -41,5 +41,5 @@ def offer(s: Any, prm: Any, m: Any, aids: Any) -> Offer:
         row = ((POS, (0.0, 0.0, -1.0)), (LAST, (0.0, 0.0, 1.0)), NONE)
     return (
         ONE, C_ALTITUDE, (z, 0.0, 0.0), (h, 0.0, 0.0), (r, r, r), (row, row, row), prm.gate_barometer, prm.timeout_barometer, R_NONE,
-        ANY_TURN,
+        ANY_TURN, HARD,
     )  # fmt: skip

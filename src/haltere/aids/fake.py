@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 from haltere._jit import jit
-from haltere.aids.fusing import ANY_TURN, NO_GATE, NO_TIMEOUT, NO_TURN, THREE, ZEROS, Offer, unit_rows
+from haltere.aids.fusing import ANY_TURN, HARD, NO_GATE, NO_TIMEOUT, NO_TURN, THREE, ZEROS, Offer, unit_rows
 from haltere.aids.record import C_POS, C_VEL, GNSS_POSITION, MAGNETOMETER, R_NONE
 from haltere.strapdown.layout import POS, VEL
 
@@ -37,11 +37,11 @@ def offer_position(s: Any, prm: Any, resting: bool) -> Offer:
     sd = prm.noise_fake_position_rest if resting else prm.noise_fake_position
     r = sd * sd
     z, h = (s.anchor[0], s.anchor[1], s.anchor[2]), (s.p[0], s.p[1], s.p[2])
-    return THREE, C_POS, z, h, (r, r, r), unit_rows(POS), NO_GATE, NO_TIMEOUT, R_NONE, turn_allowed(s, prm)
+    return THREE, C_POS, z, h, (r, r, r), unit_rows(POS), NO_GATE, NO_TIMEOUT, R_NONE, turn_allowed(s, prm), HARD
 
 
 @jit
 def offer_velocity(s: Any, prm: Any) -> Offer:
     """Velocity is zero within ``noise.fake_velocity``: what attitude alone knows of where down is (theory-amendments.md §8)."""
     r = prm.noise_fake_velocity * prm.noise_fake_velocity
-    return THREE, C_VEL, ZEROS, (s.v[0], s.v[1], s.v[2]), (r, r, r), unit_rows(VEL), NO_GATE, NO_TIMEOUT, R_NONE, turn_allowed(s, prm)
+    return THREE, C_VEL, ZEROS, (s.v[0], s.v[1], s.v[2]), (r, r, r), unit_rows(VEL), NO_GATE, NO_TIMEOUT, R_NONE, turn_allowed(s, prm), HARD

@@ -21,18 +21,21 @@ from haltere.aids.record import (
 )
 from haltere.core.rotation import Vec, dcm
 from haltere.filter.gates import ABSENT, inflation, joint_nis, optimal_gain
+from haltere.filter.robust import PLAIN, inflate
 from haltere.filter.update import NONE, Row, apply, innovation, project, variance
 from haltere.strapdown.propagate import inject
 
 __all__ = [
     "ANY_TURN",
     "DISTRUSTED",
+    "HARD",
     "NOTHING",
     "NO_GATE",
     "NO_TIMEOUT",
     "NO_TURN",
     "ONLY_TURN",
     "Offer",
+    "Robust",
     "fuse_offer",
     "judge",
     "unit_rows",
@@ -40,11 +43,17 @@ __all__ = [
 
 #: What an aid has to say of one measurement, the same shape for all, so that one machine-code version fuses them all:
 #: number of components (0: nothing to fuse), code of the first, observations z, their predictions h, variances r, rows of H,
-#: gate [sigma], timeout [s], reason to refuse it whatever the test says, and what it may do to the turn about the vertical.
-Offer = tuple[int, int, Vec, Vec, Vec, tuple[Row, Row, Row], float, float, int, int]
+#: gate [sigma], timeout [s], reason to refuse it whatever the test says, what it may do to the turn about the vertical, and `Robust`.
+Offer = tuple[int, int, Vec, Vec, Vec, tuple[Row, Row, Row], float, float, int, int, tuple[int, float, float]]
+#: How large innovations are taken: form of `haltere.filter.robust`, deviation sqrt(NIS/n) from which the variance is inflated (up to
+#: the gate, from where it is dropped) [sigma], and the weight that other tests of the aid leave it (1: all; 1/weight is a factor on r).
+Robust = tuple[int, float, float]
 
 #: The gain as it is, only its turn about the vertical, or all but that.
 ANY_TURN, ONLY_TURN, NO_TURN = (constant(i) for i in (0, 1, 2))
+
+#: No robust weight: all up to the gate.
+HARD = (PLAIN, 1e9, 1.0)
 
 NO_GATE, NO_TIMEOUT = 1e9, 1e18
 #: What ``started`` says of a sensor.
@@ -54,7 +63,7 @@ PROBATION = 10.0
 ZERO, ONE, THREE = (constant(i) for i in (0, 1, 3))
 ZEROS = (0.0, 0.0, 0.0)
 #: An offer of nothing.
-NOTHING = (ZERO, ZERO, ZEROS, ZEROS, ZEROS, ((NONE, NONE, NONE), (NONE, NONE, NONE), (NONE, NONE, NONE)), 1.0, 1.0, ZERO, ANY_TURN)
+NOTHING = (ZERO, ZERO, ZEROS, ZEROS, ZEROS, ((NONE, NONE, NONE), (NONE, NONE, NONE), (NONE, NONE, NONE)), 1.0, 1.0, ZERO, ANY_TURN, HARD)
 
 
 @jit
@@ -118,7 +127,8 @@ def fuse_offer(s: Any, aids: Any, t: float, sensor: int, offer: Offer) -> None:
     offer
         What the aid has to say, see `Offer`.
     """
-    n, component, z, h, r, H, gate, timeout, reason, turn = offer
+    n, component, z, h, r, H, gate, timeout, reason, turn, robust = offer
+    form, soft, weighed = robust
     if n == 0:
         return
     H0, H1, H2 = H
@@ -133,7 +143,13 @@ def fuse_offer(s: Any, aids: Any, t: float, sensor: int, offer: Offer) -> None:
         nis, s_ii = joint_nis(s, H0, H1, H2, e, r)
     ratio = nis / (gate * gate)
     status, reason, weight = judge(s, sensor, t, ratio, timeout, reason)
-    if status == DEWEIGHTED:
+    if status == FUSED:
+        present = (1.0 if ok0 else 0.0) + (1.0 if ok1 else 0.0) + (1.0 if ok2 else 0.0)
+        weight = weighed / inflate(form, math.sqrt(nis / max(present, 1.0)), soft, gate)
+        if weight < 1.0:
+            status = DEWEIGHTED
+            r = (r[0] / weight, r[1] / weight, r[2] / weight)
+    elif status == DEWEIGHTED:
         r = (inflation(nis, gate, s_ii[0], r[0]), inflation(nis, gate, s_ii[1], r[1]), inflation(nis, gate, s_ii[2], r[2]))
     if weight > 0.0:
         for i in range(3):

@@ -6,7 +6,7 @@ import math
 from typing import Any
 
 from haltere._jit import jit
-from haltere.aids.fusing import ANY_TURN, NOTHING, RUNNING, THREE, Offer
+from haltere.aids.fusing import ANY_TURN, HARD, NOTHING, RUNNING, THREE, Offer
 from haltere.aids.record import BAROMETER, C_POS, C_VEL, E_RESET, FUSED, GNSS_POSITION, R_NONE, R_START, event, record
 from haltere.core.earth import gravity, local_from_geodetic
 from haltere.core.rotation import Mat, Vec, cross, dcm, dot, mat_vec
@@ -82,7 +82,7 @@ def offer_velocity(s: Any, prm: Any, m: Any) -> Offer:
     h = (s.v[0] + offset[0], s.v[1] + offset[1], s.v[2] + offset[2])
     z, r = (m.z[0], m.z[1], m.z[2]), velocity_variance(prm, m.r)
     s.yaw.z[0], s.yaw.z[1], s.yaw.r, s.yaw.fresh = z[0] - offset[0], z[1] - offset[1], r[0], 1
-    return THREE, C_VEL, z, h, r, H, prm.gate_gnss, prm.timeout_gnss, R_NONE, ANY_TURN
+    return THREE, C_VEL, z, h, r, H, prm.gate_gnss, prm.timeout_gnss, R_NONE, ANY_TURN, HARD
 
 
 @jit
@@ -128,4 +128,4 @@ def offer_position(s: Any, prm: Any, m: Any, aids: Any, dt: float) -> Offer:
     T = lever_rows(C, arm, -1.0)
     H = (((THETA, T[0]), (POS, ONES[0]), NONE), ((THETA, T[1]), (POS, ONES[1]), NONE), ((THETA, T[2]), (POS, ONES[2]), NONE))
     h = (s.p[0] + offset[0], s.p[1] + offset[1], s.p[2] + offset[2])
-    return THREE, C_POS, z, h, r, H, prm.gate_gnss, prm.timeout_gnss, R_NONE, ANY_TURN
+    return THREE, C_POS, z, h, r, H, prm.gate_gnss, prm.timeout_gnss, R_NONE, ANY_TURN, HARD

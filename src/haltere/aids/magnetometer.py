@@ -6,7 +6,7 @@ import math
 from typing import Any
 
 from haltere._jit import jit
-from haltere.aids.fusing import ANY_TURN, NOTHING, ONE, ONLY_TURN, RUNNING, THREE, Offer
+from haltere.aids.fusing import ANY_TURN, HARD, NOTHING, ONE, ONLY_TURN, RUNNING, THREE, Offer
 from haltere.aids.record import (
     C_HEADING,
     C_MAG,
@@ -119,7 +119,7 @@ def offer(s: Any, prm: Any, m: Any, aids: Any) -> Offer:
     r = sd * sd
     return (
         ONE, C_HEADING, (heading, 0.0, 0.0), (0.0, 0.0, 0.0), (r, r, r), (row, row, row), prm.gate_magnetometer, prm.timeout_magnetometer,
-        reason, ONLY_TURN,
+        reason, ONLY_TURN, HARD,
     )  # fmt: skip
 
 
@@ -133,4 +133,4 @@ def offer_axes(s: Any, prm: Any, C: Mat, z: Vec, reason: int) -> Offer:
         ((THETA, (h[2], 0.0, -h[0])), NONE, NONE),
         ((THETA, (-h[1], h[0], 0.0)), NONE, NONE),
     )
-    return THREE, C_MAG, z, h, (r, r, r), H, prm.gate_magnetometer, prm.timeout_magnetometer, reason, ANY_TURN
+    return THREE, C_MAG, z, h, (r, r, r), H, prm.gate_magnetometer, prm.timeout_magnetometer, reason, ANY_TURN, HARD
