@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from haltere._jit import as_records
+from haltere.aids.compass import OUT_APART, OUT_FIELD, OUT_TURN
 from haltere.aids.record import AID_RECORD, COMPONENTS, EVENTS, N_QUEUED, REASONS, SENSORS, STATUSES, YAW_BANK
 from haltere.errors import HaltereError, UsageError
 from haltere.estimators import step as kernels
@@ -198,25 +199,35 @@ def _drain(S: NDArray[np.void], aids: NDArray[np.void], parts: list[NDArray[np.v
         S["n_aids"] = 0
     for e in S["event"][0, : int(S["n_events"][0])]:
         kind = EVENTS[int(e["code"])]
-        sensor = SENSORS[int(e["sensor"])] if kind in ("reset", "timeout", "recovered") else ("imu" if kind == "gap" else "filter")
-        events.append(_event(kind, sensor, float(e["t"]), float(e["value"]), int(e["sensor"]) == YAW_BANK))
+        named = kind in ("reset", "timeout", "recovered", "disturb")
+        sensor = SENSORS[int(e["sensor"])] if named else ("imu" if kind == "gap" else "filter")
+        events.append(_event(kind, sensor, e, int(e["sensor"]) == YAW_BANK))
     S["n_events"] = 0
 
 
-def _event(kind: str, sensor: str, t: float, value: float, bank: bool) -> dict[str, Any]:
+def _event(kind: str, sensor: str, record: np.void, bank: bool) -> dict[str, Any]:
+    t, value, threshold = float(record["t"]), float(record["value"]), float(record["threshold"])
     code = int(value) if math.isfinite(value) else 0
+    turned, allowed = f"{math.degrees(value):.0f} deg", f"{math.degrees(threshold):.0f} deg"
     how = {1: "at rest", 2: "in motion, from GNSS velocity", 3: "from gravity alone", 4: "in motion, from two turns of GNSS velocity"}
     evidence = {
         "aligned": f"initial alignment {how.get(code, '')}",
         "realigned": f"aligned anew {how.get(code, '')}",
         "reset": f"yaw set from GNSS velocity, turned by {math.degrees(value):.0f} deg" if bank else "first measurement sets the state",
+        "disturb": {
+            OUT_TURN: f"the compass turned by {turned} against the gyro; {allowed} are allowed",
+            OUT_FIELD: "strength or dip of the field are not those of before, or not the Earth's",
+            OUT_APART: f"the compass is {turned} off the heading that everything else holds; {allowed} are allowed",
+        }.get(int(record["detail"]), ""),
+        "recovered": f"agrees again, {value:.1f} s after the onset",
         "timeout": f"refused for {value:.1f} s, let in again at the gate's edge",
         "gap": f"{value:.2f} s without IMU samples",
         "diverged": "state or covariance not finite or not positive",
     }.get(kind, kind)
     return {
-        "sensor": sensor, "axis": None, "kind": kind, "t_onset": t, "t_detected": t, "t_isolated": None, "t_recovered": None,
-        "candidates": [], "statistic": value, "threshold": None, "evidence": evidence,
+        "sensor": sensor, "axis": None, "kind": kind, "t_onset": float(record["onset"]), "t_detected": t, "t_isolated": None,
+        "t_recovered": None, "candidates": [], "statistic": value, "threshold": threshold if math.isfinite(threshold) else None,
+        "evidence": evidence,
     }  # fmt: skip
 
 

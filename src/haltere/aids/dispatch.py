@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 from haltere._jit import jit
-from haltere.aids import barometer, fake, gnss, magnetometer, rest, zero_rate, zero_velocity
+from haltere.aids import barometer, compass, fake, gnss, interference, magnetometer, rest, zero_rate, zero_velocity
 from haltere.aids.fusing import NOTHING, Offer, fuse_offer
 from haltere.aids.record import (
     BAROMETER,
@@ -15,15 +15,16 @@ from haltere.aids.record import (
     GNSS_VELOCITY,
     MAGNETOMETER,
     N_QUEUED,
+    POWER,
     ZERO_RATE,
     ZERO_VELOCITY,
 )
-from haltere.core.rotation import Vec
+from haltere.core.rotation import Vec, dcm
 from haltere.filter.queue import pop_due
 
 __all__ = ["N_SENSORS", "due", "fuse_all", "offer_of"]
 
-N_SENSORS = 8
+N_SENSORS = 9
 
 
 @jit
@@ -37,6 +38,9 @@ def offer_of(s: Any, prm: Any, sensor: int, m: Any, aids: Any, dt: float, w: Vec
         return barometer.offer(s, prm, m, aids)
     if sensor == MAGNETOMETER:
         return magnetometer.offer(s, prm, m, aids)
+    if sensor == POWER:
+        interference.hear(s, m.t, m.z[0])
+        return NOTHING
     if sensor == ZERO_VELOCITY:
         return zero_velocity.offer(s, prm)
     if sensor == ZERO_RATE:
@@ -84,7 +88,12 @@ def fuse_all(s: Any, prm: Any, aids: Any, dt: float, w: Vec, f: Vec) -> None:
         if i >= 0:
             m = s.ring[sensor if sensor < N_QUEUED else 0, i]
             resting = s.rest.still == 1 and s.rest.moved == 0
-            fuse_offer(s, aids, t, sensor, offer_of(s, prm, sensor, m, aids, dt, w, resting))
+            d = dcm((s.q[0], s.q[1], s.q[2], s.q[3]))[2]
+            offer = offer_of(s, prm, sensor, m, aids, dt, w, resting)
+            yaw, bias = s.yaw_corrected, d[0] * s.bg[0] + d[1] * s.bg[1] + d[2] * s.bg[2]
+            fuse_offer(s, aids, t, sensor, offer)
+            if sensor == MAGNETOMETER:
+                compass.attribute(s, yaw, bias)
         if i < 0 or sensor >= N_QUEUED:  # a queue is emptied before the next sensor
             sensor += 1
     wake = s.aid[N_QUEUED].t_due

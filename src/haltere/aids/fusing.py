@@ -44,16 +44,17 @@ __all__ = [
 #: What an aid has to say of one measurement, the same shape for all, so that one machine-code version fuses them all:
 #: number of components (0: nothing to fuse), code of the first, observations z, their predictions h, variances r, rows of H,
 #: gate [sigma], timeout [s], reason to refuse it whatever the test says, what it may do to the turn about the vertical, and `Robust`.
-Offer = tuple[int, int, Vec, Vec, Vec, tuple[Row, Row, Row], float, float, int, int, tuple[int, float, float]]
+Offer = tuple[int, int, Vec, Vec, Vec, tuple[Row, Row, Row], float, float, int, int, tuple[int, float, float, float]]
 #: How large innovations are taken: form of `haltere.filter.robust`, deviation sqrt(NIS/n) from which the variance is inflated (up to
-#: the gate, from where it is dropped) [sigma], and the weight that other tests of the aid leave it (1: all; 1/weight is a factor on r).
-Robust = tuple[int, float, float]
+#: the gate, from where it is dropped) [sigma], the weight that other tests of the aid leave it (1: all; 1/weight is a factor on r),
+#: and how many successive samples share one error (1: none): a factor on r that no test sees.
+Robust = tuple[int, float, float, float]
 
 #: The gain as it is, only its turn about the vertical, or all but that.
 ANY_TURN, ONLY_TURN, NO_TURN = (constant(i) for i in (0, 1, 2))
 
 #: No robust weight: all up to the gate.
-HARD = (PLAIN, 1e9, 1.0)
+HARD = (PLAIN, 1e9, 1.0, 1.0)
 
 NO_GATE, NO_TIMEOUT = 1e9, 1e18
 #: What ``started`` says of a sensor.
@@ -128,7 +129,7 @@ def fuse_offer(s: Any, aids: Any, t: float, sensor: int, offer: Offer) -> None:
         What the aid has to say, see `Offer`.
     """
     n, component, z, h, r, H, gate, timeout, reason, turn, robust = offer
-    form, soft, weighed = robust
+    form, soft, weighed, shared = robust
     if n == 0:
         return
     H0, H1, H2 = H
@@ -152,6 +153,7 @@ def fuse_offer(s: Any, aids: Any, t: float, sensor: int, offer: Offer) -> None:
     elif status == DEWEIGHTED:
         r = (inflation(nis, gate, s_ii[0], r[0]), inflation(nis, gate, s_ii[1], r[1]), inflation(nis, gate, s_ii[2], r[2]))
     if weight > 0.0:
+        r = (shared * r[0], shared * r[1], shared * r[2])
         for i in range(3):
             row, r_i, e_i, ok = H0, r[0], e[0], ok0
             if i == 1:

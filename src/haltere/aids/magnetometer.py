@@ -6,7 +6,8 @@ import math
 from typing import Any
 
 from haltere._jit import jit
-from haltere.aids.fusing import ANY_TURN, HARD, NOTHING, ONE, ONLY_TURN, RUNNING, THREE, Offer
+from haltere.aids import compass, interference
+from haltere.aids.fusing import ANY_TURN, NO_TIMEOUT, NOTHING, ONE, ONLY_TURN, RUNNING, THREE, Offer, Robust
 from haltere.aids.record import (
     C_HEADING,
     C_MAG,
@@ -22,6 +23,7 @@ from haltere.aids.record import (
     record,
 )
 from haltere.core.rotation import Mat, Vec, dcm, mat_vec, norm, quat_from_rotvec, quat_mul, quat_unit, tmat_vec, wrap
+from haltere.filter.robust import IGG3
 from haltere.filter.update import NONE, symmetrise
 from haltere.strapdown.layout import THETA
 
@@ -91,15 +93,19 @@ def offer(s: Any, prm: Any, m: Any, aids: Any) -> Offer:
     """Magnetometer sample ``m.z`` [uT, body]. Starts by setting yaw where that is unknown, then heading or three axes."""
     z = (m.z[0], m.z[1], m.z[2])
     C = dcm((s.q[0], s.q[1], s.q[2], s.q[3]))
+    if prm.aid_motor_field > 0.0 and s.has_field == 1:
+        interference.learn(s, m.t, z, field_n(s), C)
+        z = interference.cleaned(s, z)
     mu = mat_vec(C, z)
     a = s.aid[MAGNETOMETER]
     horizontal = math.sqrt(mu[0] * mu[0] + mu[1] * mu[1])
     if s.has_field == 0:
         learn_field(s, mu, s.field[0])
-    reason = R_NONE
-    if abs(norm(z) / s.field[2] - 1.0) > prm.field_tolerance_strength:
+    reason, weight = R_NONE, 1.0
+    strength, dip = norm(z), math.atan2(mu[2], horizontal)
+    if abs(strength / s.field[2] - 1.0) > prm.field_tolerance_strength:
         reason = R_STRENGTH
-    elif abs(math.atan2(mu[2], horizontal) - s.field[1]) > prm.field_tolerance_dip:
+    elif abs(dip - s.field[1]) > prm.field_tolerance_dip:
         reason = R_DIP
     elif horizontal < 0.2 * s.field[2] * math.cos(s.field[1]):
         reason = R_HORIZONTAL
@@ -112,25 +118,38 @@ def offer(s: Any, prm: Any, m: Any, aids: Any) -> Offer:
             event(s, m.t, E_RESET, MAGNETOMETER, heading)
             record(s, aids, m.t, MAGNETOMETER, C_HEADING, heading, 0.0, prm.init_yaw_compass, 0.0, 1.0, FUSED, R_START)
             return NOTHING
+    timeout = prm.timeout_magnetometer
+    if prm.aid_compass_watch > 0.0 and a.started > 0:
+        timeout = NO_TIMEOUT  # the watch says when the compass is to be heard again
+        if reason == R_NONE:
+            weight, reason = compass.level(s, prm, strength, dip, m.t - s.compass.t_last)
+        watched = compass.observe(s, prm, m.t, heading, weight if reason == R_NONE else 0.0, C)
+        if reason == R_NONE:
+            reason = watched
+    white, slow = prm.noise_magnetometer * prm.noise_magnetometer, prm.noise_field * prm.noise_field
+    shared = 1.0
+    if slow > 0.0:  # within its correlation time an error is the same in every sample: together they are worth one
+        since = max(m.t - s.compass.t_before, 1e-3)
+        shared = 1.0 + slow / (white + slow) * max(2.0 * prm.noise_field_time / since - 1.0, 0.0)
+    s.compass.t_before = m.t
+    robust = (IGG3, prm.robust_innovation, weight, shared)
     if prm.aid_magnetometer == 2.0:
-        return offer_axes(s, prm, C, z, reason)
-    sd = prm.noise_magnetometer / max(horizontal, 1e-3)
+        return offer_axes(s, prm, C, z, white + slow, timeout, reason, robust)
     row = ((THETA, heading_row(C, s.field[0], s.field[1])), NONE, NONE)
-    r = sd * sd
+    r = (white + slow) / max(horizontal * horizontal, 1e-6)
     return (
-        ONE, C_HEADING, (heading, 0.0, 0.0), (0.0, 0.0, 0.0), (r, r, r), (row, row, row), prm.gate_magnetometer, prm.timeout_magnetometer,
-        reason, ONLY_TURN, HARD,
+        ONE, C_HEADING, (heading, 0.0, 0.0), (0.0, 0.0, 0.0), (r, r, r), (row, row, row), prm.gate_magnetometer, timeout,
+        reason, ONLY_TURN, robust,
     )  # fmt: skip
 
 
 @jit
-def offer_axes(s: Any, prm: Any, C: Mat, z: Vec, reason: int) -> Offer:
+def offer_axes(s: Any, prm: Any, C: Mat, z: Vec, r: float, timeout: float, reason: int, robust: Robust) -> Offer:
     """Three axes: h = Cᵀ m_n, H_θ = [Cᵀ m_n]× (theory.md §2.1, §3.6)."""
     h = tmat_vec(C, field_n(s))
-    r = prm.noise_magnetometer * prm.noise_magnetometer
     H = (
         ((THETA, (0.0, -h[2], h[1])), NONE, NONE),
         ((THETA, (h[2], 0.0, -h[0])), NONE, NONE),
         ((THETA, (-h[1], h[0], 0.0)), NONE, NONE),
     )
-    return THREE, C_MAG, z, h, (r, r, r), H, prm.gate_magnetometer, prm.timeout_magnetometer, reason, ANY_TURN, HARD
+    return THREE, C_MAG, z, h, (r, r, r), H, prm.gate_magnetometer, timeout, reason, ANY_TURN, robust

@@ -2,23 +2,28 @@
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 import numpy as np
 
 from haltere._jit import constant, jit
 
-__all__ = ["AID_RECORD", "COMPONENTS", "EVENTS", "REASONS", "SENSORS", "STATUSES", "event", "record"]
+__all__ = ["AID_RECORD", "COMPONENTS", "EVENTS", "REASONS", "SENSORS", "STATUSES", "event", "event_since", "record"]
 
-#: Sensor codes, and indices of the filter's memory of each sensor. The first four arrive from outside and are queued; the last
+#: Sensor codes, and indices of the filter's memory of each sensor. The first five arrive from outside and are queued; the last
 #: is the bank of yaw hypotheses, which speaks of GNSS velocity.
-GNSS_VELOCITY, GNSS_POSITION, BAROMETER, MAGNETOMETER, ZERO_VELOCITY, ZERO_RATE, FAKE_POSITION, FAKE_VELOCITY, YAW_BANK = (
-    constant(i) for i in range(9)
+GNSS_VELOCITY, GNSS_POSITION, BAROMETER, MAGNETOMETER, POWER, ZERO_VELOCITY, ZERO_RATE, FAKE_POSITION, FAKE_VELOCITY, YAW_BANK = (
+    constant(i) for i in range(10)
 )
-N_QUEUED = 4
+N_QUEUED = 5
 #: Sensor of an event that no sensor made.
 NO_SENSOR = constant(0)
-SENSORS = ("gnss", "gnss", "barometer", "magnetometer", "zero_velocity", "zero_rate", "fake_position", "fake_velocity", "gnss")
+#: Detail of an event that has none.
+NO_DETAIL = constant(0)
+SENSORS = (
+    "gnss", "gnss", "barometer", "magnetometer", "power", "zero_velocity", "zero_rate", "fake_position", "fake_velocity", "gnss",
+)  # fmt: skip
 
 COMPONENTS = (
     "vel_n",
@@ -41,11 +46,13 @@ C_VEL, C_POS, C_ALTITUDE, C_HEADING, C_MAG, C_RATE = (constant(i) for i in (0, 3
 STATUSES = ("fused", "deweighted", "rejected", "held")
 FUSED, DEWEIGHTED, REJECTED, HELD = (constant(i) for i in range(4))
 
-REASONS = ("", "innovation", "timeout", "start", "field strength", "dip", "no horizontal field", "alignment", "distrusted")
-R_NONE, R_INNOVATION, R_TIMEOUT, R_START, R_STRENGTH, R_DIP, R_HORIZONTAL, R_ALIGNMENT, R_DISTRUSTED = (constant(i) for i in range(9))
+REASONS = ("", "innovation", "timeout", "start", "field strength", "dip", "no horizontal field", "alignment", "distrusted", "disturbed")
+R_NONE, R_INNOVATION, R_TIMEOUT, R_START, R_STRENGTH, R_DIP, R_HORIZONTAL, R_ALIGNMENT, R_DISTRUSTED, R_DISTURBED = (
+    constant(i) for i in range(10)
+)
 
-EVENTS = ("aligned", "reset", "diverged", "realigned", "gap", "recovered", "timeout")
-E_ALIGNED, E_RESET, E_DIVERGED, E_REALIGNED, E_GAP, E_RECOVERED, E_TIMEOUT = (constant(i) for i in range(7))
+EVENTS = ("aligned", "reset", "diverged", "realigned", "gap", "recovered", "timeout", "disturb")
+E_ALIGNED, E_RESET, E_DIVERGED, E_REALIGNED, E_GAP, E_RECOVERED, E_TIMEOUT, E_DISTURBED = (constant(i) for i in range(8))
 
 AID_RECORD = np.dtype(
     [
@@ -101,10 +108,16 @@ def record(
 @jit
 def event(s: Any, t: float, code: int, sensor: int, value: float) -> None:
     """Append one event of the filter; without room it is counted."""
+    event_since(s, t, t, code, sensor, value, math.nan, NO_DETAIL)
+
+
+@jit
+def event_since(s: Any, t: float, onset: float, code: int, sensor: int, value: float, threshold: float, detail: int) -> None:
+    """Append an event detected at t that began at ``onset``, with the threshold that ``value`` passed and a code of what kind it is."""
     i = s.n_events
     if i < len(s.event):
         e = s.event[i]
-        e.t, e.code, e.sensor, e.value = t, code, sensor, value
+        e.t, e.onset, e.code, e.sensor, e.value, e.threshold, e.detail = t, onset, code, sensor, value, threshold, detail
         s.n_events = i + 1
     else:
         s.n_events_lost += 1

@@ -9,6 +9,6 @@ from __future__ import annotations
 NAME = "ahrs"
 #: Streams without which it cannot run, and those that it uses.
 NEEDS = ("imu",)
-USES = ("imu", "magnetometer")
+USES = ("imu", "magnetometer", "power")
 #: It gives attitude and gyro bias only.
 POSITION = False

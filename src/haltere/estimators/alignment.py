@@ -10,7 +10,7 @@ import math
 from typing import Any
 
 from haltere._jit import constant, jit
-from haltere.aids import rest
+from haltere.aids import compass, interference, rest
 from haltere.aids.fusing import DISTRUSTED, RUNNING
 from haltere.aids.gnss import position_observation, position_variance, velocity_variance
 from haltere.aids.magnetometer import learn_field
@@ -23,6 +23,7 @@ from haltere.aids.record import (
     MAGNETOMETER,
     N_QUEUED,
     NO_SENSOR,
+    POWER,
     event,
 )
 from haltere.core.rotation import (
@@ -87,6 +88,9 @@ def begin(s: Any, t: float) -> None:
         s.aid[k].t_passed = t
     rest.forget(s)
     yaw_bank.forget(s)
+    compass.forget(s)
+    s.compass.known = 0
+    interference.forget(s)
     s.rest.moved = 0
     open_span(s, t)
 
@@ -120,6 +124,8 @@ def take_due(s: Any, prm: Any) -> bool:
             elif kind == BAROMETER:
                 a.baro, a.t_baro = m.z[0], m.t
                 a.n_baro += 1.0
+            elif kind == POWER:
+                interference.hear(s, m.t, m.z[0])
             elif kind == MAGNETOMETER:
                 mu = mat_vec(dcm((a.q[0], a.q[1], a.q[2], a.q[3])), (m.z[0], m.z[1], m.z[2]))
                 a.n_m += 1.0

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from haltere._jit import as_records
-from haltere.aids.record import AID_RECORD, BAROMETER, GNSS_POSITION, GNSS_VELOCITY, MAGNETOMETER
+from haltere.aids.record import AID_RECORD, BAROMETER, GNSS_POSITION, GNSS_VELOCITY, MAGNETOMETER, POWER
 from haltere.core.earth import STANDARD_GRAVITY, gravity
 from haltere.errors import HaltereError, UsageError
 from haltere.estimators import step as kernels
@@ -32,6 +32,7 @@ _VALUES = {
     "gnss": ("lat", "lon", "alt", "vel_n", "vel_e", "vel_d"),
     "barometer": ("pressure",),
     "magnetometer": ("mag_x", "mag_y", "mag_z"),
+    "power": ("current",),
 }
 _ACCURACIES = ("h_acc", "h_acc", "v_acc", "s_acc", "s_acc", "s_acc")
 
@@ -229,12 +230,12 @@ class Estimator:
         Parameters
         ----------
         sensor
-            ``gnss``, ``barometer`` or ``magnetometer``.
+            ``gnss``, ``barometer``, ``magnetometer`` or ``power``.
         t
             Time stamp [s]; it was valid at t minus the configured delay.
         values
             By column name as in the flight folder, or in order: gnss ``lat, lon, alt[, vel_n, vel_e, vel_d]`` (deg, m, m/s),
-            barometer ``pressure`` [Pa], magnetometer ``mag_x, mag_y, mag_z`` [uT].
+            barometer ``pressure`` [Pa], magnetometer ``mag_x, mag_y, mag_z`` [uT], power ``current`` [A].
         variances
             Of the values in order, for gnss (lat, lon and alt in m^2); NaN, not positive or absent: as configured.
 
@@ -252,7 +253,10 @@ class Estimator:
         if sensor not in _VALUES:
             near = nearest_stream(str(sensor), _VALUES)
             raise UsageError(
-                "a sensor: gnss, barometer or magnetometer", repr(sensor), "Estimator.offer", f"did you mean {near!r}?" if near else ""
+                "a sensor: gnss, barometer, magnetometer or power",
+                repr(sensor),
+                "Estimator.offer",
+                f"did you mean {near!r}?" if near else "",
             )
         t = _number(t, "t", "Estimator.offer")
         if not math.isfinite(t):
@@ -263,6 +267,11 @@ class Estimator:
             raise UsageError(f"no variances for {sensor}", "some", "Estimator.offer", f"set noise.{sensor}")
         if sensor == "barometer":
             return self._offer_barometer(t, values)
+        if sensor == "power":
+            (current,) = _in_order(sensor, values, 1, ("voltage",))
+            return (
+                self._queue(POWER, t, (current, math.nan, math.nan), _NAN) if math.isfinite(current) else self._refuse(sensor, "not finite")
+            )
         m = _in_order(sensor, values, 3)
         if not math.isfinite(m[0] + m[1] + m[2]):
             return self._refuse(sensor, "not finite")
@@ -322,7 +331,12 @@ class Estimator:
         out = {sensor: dict(reasons) for sensor, reasons in self._refused.items()}
         if n := int(self._S["n_bad"][0]):
             out["imu"] = {"refused by the filter": n}
-        for sensor, kinds in (("gnss", (GNSS_POSITION, GNSS_VELOCITY)), ("barometer", (BAROMETER,)), ("magnetometer", (MAGNETOMETER,))):
+        for sensor, kinds in (
+            ("gnss", (GNSS_POSITION, GNSS_VELOCITY)),
+            ("barometer", (BAROMETER,)),
+            ("magnetometer", (MAGNETOMETER,)),
+            ("power", (POWER,)),
+        ):
             for field, reason in (("n_late", "later than the fusion horizon"), ("n_overflow", "queue full before the first IMU sample")):
                 if n := sum(int(self._S["aid"][field][0, k]) for k in kinds):
                     out.setdefault(sensor, {})[reason] = n

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from haltere._jit import as_records, entry
-from haltere.aids.record import BAROMETER, GNSS_POSITION, GNSS_VELOCITY, MAGNETOMETER
+from haltere.aids.record import BAROMETER, GNSS_POSITION, GNSS_VELOCITY, MAGNETOMETER, POWER
 from haltere.core.earth import pressure_altitude
 from haltere.errors import UsageError
 from haltere.flight import config as configuration
@@ -178,6 +178,11 @@ def measurements(flight: FlightLog, checked: Checked, config: Config) -> Measure
     mag = checked.streams.get("magnetometer")
     if mag is not None and config["aid.magnetometer"] != "off":
         parts.append((MAGNETOMETER, mag.t, mounted(flight, "magnetometer", mag.vector("mag")), np.full((len(mag), 3), np.nan)))
+    power = checked.streams.get("power")  # only worth hearing for the compass
+    if power is not None and parts and parts[-1][0] == MAGNETOMETER and config["aid.motor_field"] == "on":
+        current = power.get("current")
+        value = np.column_stack([current, np.full((len(power), 2), np.nan)])
+        parts.append((POWER, power.t, value, np.full_like(value, np.nan)))
     if not parts:
         return Measurements(np.empty(0, np.int64), np.empty(0), np.empty((0, 3)), np.empty((0, 3)))
     kind = np.concatenate([np.full(len(t), k, np.int64) for k, t, _, _ in parts])

@@ -9,6 +9,6 @@ from __future__ import annotations
 NAME = "navigator"
 #: Streams without which it cannot run, and those that it uses.
 NEEDS = ("imu",)
-USES = ("imu", "gnss", "magnetometer", "barometer")
+USES = ("imu", "gnss", "magnetometer", "barometer", "power")
 #: Columns of its solution beyond attitude, velocity, position and biases.
 POSITION = True

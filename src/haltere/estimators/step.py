@@ -16,6 +16,7 @@ from haltere.aids.record import (
     GNSS_VELOCITY,
     MAGNETOMETER,
     NO_SENSOR,
+    POWER,
     event,
 )
 from haltere.core.rotation import Vec, cross, dcm, mat_vec, quat_from_rotvec, quat_mul
@@ -361,6 +362,8 @@ def offer(S: Any, PRM: Any, kind: int, t: float, z: Vec, r: Vec) -> int:
         delay, on = prm.delay_barometer, prm.aid_barometer
     elif kind == MAGNETOMETER:
         delay, on = prm.delay_magnetometer, prm.aid_magnetometer
+    elif kind == POWER:
+        delay, on = prm.delay_power, prm.aid_motor_field
     if on == 0.0:
         return 2
     return push(s, kind, t - delay, z, r)

@@ -37,7 +37,7 @@ def forget(s: Any) -> None:
     """Begin with five equally likely hypotheses around the circle."""
     b = s.yaw
     b.n, b.dv[0], b.dv[1], b.t = 0, 0.0, 0.0, s.t
-    s.yaw_corrected = 0.0
+    b.corrected = s.yaw_corrected
     for i in range(HYPOTHESES):
         b.w[i] = 1.0 / HYPOTHESES
         for j in range(3):
@@ -53,8 +53,8 @@ def follow(s: Any) -> None:
     """Take the corrections of the filter's yaw since the last call off its error."""
     b = s.yaw
     for i in range(HYPOTHESES):
-        b.x[i, 2] = wrap(b.x[i, 2] - s.yaw_corrected)
-    s.yaw_corrected = 0.0
+        b.x[i, 2] = wrap(b.x[i, 2] - (s.yaw_corrected - b.corrected))
+    b.corrected = s.yaw_corrected
 
 
 @jit

@@ -73,6 +73,9 @@ def _axes(doc: str) -> Key:
 #: Every key (theory-amendments.md §8 unless said). NaN: from the data.
 KEYS: dict[str, Key] = {
     "noise.gyro": _positive(1.5e-3, "rad/s/sqrt(Hz)", "Gyro white noise density, vibration included. Higher trusts the aids more."),
+    "noise.gyro_scale": Key(
+        0.005, "1", "Gyro error in proportion to the rate (scale, misalignment), 1 sigma, taken as noise that lasts a second.", low=0.0
+    ),
     "noise.accel": _positive(0.035, "m/s^2/sqrt(Hz)", "Accelerometer white noise density, vibration included."),
     "noise.gyro_bias": _positive(1e-4, "rad/s/sqrt(s)", "Walk of the gyro bias."),
     "noise.accel_bias": _positive(3e-4, "m/s^2/sqrt(s)", "Walk of the accelerometer bias."),
@@ -83,7 +86,11 @@ KEYS: dict[str, Key] = {
     "noise.gnss_velocity_min": _positive(0.1, "m/s", "Least velocity accuracy believed of a receiver: its errors last for many fixes."),
     "noise.gnss_position_min": _positive(0.5, "m", "Least position accuracy believed of a receiver."),
     "noise.barometer": _positive(1.0, "m", "Barometric altitude, 1 sigma."),
-    "noise.magnetometer": _positive(5.0, "uT", "Magnetometer, 1 sigma a sample, disturbances included (theory.md §8: 0.05 G)."),
+    "noise.magnetometer": _positive(1.0, "uT", "Magnetometer, 1 sigma a sample, white."),
+    "noise.field": Key(
+        2.5, "uT", "What surroundings and calibration add to the field, 1 sigma, alike in all samples of a correlation time.", low=0.0
+    ),
+    "noise.field_time": _positive(2.0, "s", "That correlation time."),
     "noise.zero_velocity": _positive(0.05, "m/s", "Zero velocity at rest, 1 sigma at 10 Hz."),
     "noise.zero_rate": _positive(0.01, "rad/s", "Zero rate at rest, 1 sigma at 10 Hz."),
     "noise.fake_position": _positive(10.0, "m", "Fake position in flight, 1 sigma at 5 Hz."),
@@ -93,7 +100,7 @@ KEYS: dict[str, Key] = {
     ),
     "gate.gnss": _positive(5.0, "sigma", "Innovation gate of GNSS position and velocity, joint over the components."),
     "gate.barometer": _positive(5.0, "sigma", "Innovation gate of the barometer."),
-    "gate.magnetometer": _positive(3.0, "sigma", "Innovation gate of the magnetometer."),
+    "gate.magnetometer": _positive(6.0, "sigma", "Innovation gate of the magnetometer."),
     "gate.zero_velocity": _positive(5.0, "sigma", "Innovation gate of zero velocity."),
     "gate.zero_rate": _positive(5.0, "sigma", "Innovation gate of zero rate."),
     "delay.gnss_velocity": _delay("A velocity stamped t was valid at t - delay. delay.gnss sets velocity and position."),
@@ -117,6 +124,20 @@ KEYS: dict[str, Key] = {
     "arm.gnss_x": Key(0.0, "m", "GNSS antenna ahead of the IMU (FRD)."),
     "arm.gnss_y": Key(0.0, "m", "GNSS antenna right of the IMU."),
     "arm.gnss_z": Key(0.0, "m", "GNSS antenna below the IMU."),
+    "aid.compass_watch": _switch(
+        "on", "Compare the compass with the gyro and with the field so far; hear it no more while it is disturbed."
+    ),
+    "aid.motor_field": _switch("on", "Find the field of the motors' currents from the flight, and take it off the magnetometer."),
+    "delay.power": _delay("The same for the battery current."),
+    "robust.innovation": _positive(
+        2.5, "sigma", "From this heading innovation on the variance of a magnetometer sample is inflated (IGG-III), up to its gate."
+    ),
+    "robust.strength": _positive(0.04, "1", "Change of the field's strength taken as 1 sigma: inflated from two on, refused from six on."),
+    "robust.dip": _positive(2.5 * DEG, "rad", "The same for its dip."),
+    "robust.heading": _positive(5.0 * DEG, "rad", "Turn against the gyro that a compass is allowed without turning, beside its noise."),
+    "robust.calibration": _positive(
+        0.12, "1", "Error of its calibration, as a fraction of the field, that may turn a compass when the vehicle turns."
+    ),
     "field.declination": Key(
         math.nan, "rad", "Declination, east positive. Default: World Magnetic Model at home, else 0.", low=-math.pi, high=math.pi
     ),

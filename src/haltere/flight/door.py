@@ -30,10 +30,12 @@ RATE_MIN, RATE_POOR, RATE_HIGH = 10.0, 50.0, 40000.0
 #: No flight has a hole of this many seconds.
 DAY = 86400.0
 #: What estimators read.
-READ = ("imu", "magnetometer", "gnss", "barometer")
+READ = ("imu", "magnetometer", "gnss", "barometer", "power")
 IMU = ("gyro_x", "gyro_y", "gyro_z", "accel_x", "accel_y", "accel_z")
 #: No small gyro or accelerometer measures more [rad/s, m/s^2].
 RATE_MAX, FORCE_MAX = 100.0, 500.0
+#: No small vehicle draws more [A].
+CURRENT_MAX = 2000.0
 Mask = NDArray[np.bool_]
 FloatArray = NDArray[np.float64]
 
@@ -72,7 +74,7 @@ def check(flight: FlightLog, *, upright: bool = True, given: Mapping[str, Any] |
     Returns
     -------
     Checked
-        Streams imu, magnetometer, gnss, barometer with strictly increasing finite times; missing values inside a row stay NaN.
+        Streams imu, magnetometer, gnss, barometer, power with strictly increasing finite times; missing values inside a row stay NaN.
 
     Raises
     ------
@@ -96,6 +98,7 @@ def check(flight: FlightLog, *, upright: bool = True, given: Mapping[str, Any] |
         else:
             why = ", ".join(f"{reason} {k}" for reason, k in out.discarded.get(name, {}).items())
             out.warnings.append(f"{name}: none of its {n} samples can be used ({why})")
+    _check_power(flight, out)
     _check_agreement(flight, out, given or {})
     return out
 
@@ -494,6 +497,17 @@ def _check_barometer(out: Checked, stream: Stream) -> Stream:
         remedy = f"it looks like {looks}: --set unit.pressure={looks}" if looks else "check unit.pressure"
         out.warnings.append(f"barometer: expected a pressure of 30000 to 110000 Pa, found a median of {middle:.4g}; not used; {remedy}")
     return out.drop("barometer", stream, ~bad, "pressure impossible in Pa")
+
+
+def _check_power(flight: FlightLog, out: Checked) -> None:
+    """Battery current, where there is any: only the compass listens to it, so that a log without says nothing."""
+    stream = flight.get("power")
+    if stream is None or not len(stream):
+        return
+    stream = _clean_time(out, "power", stream)
+    current = stream.get("current")
+    if np.isfinite(current).any():
+        out.streams["power"] = out.drop("power", stream, np.abs(current) < CURRENT_MAX, "current not finite or impossible in A")
 
 
 def fit(flight: FlightLog, checked: Checked) -> FlightLog:

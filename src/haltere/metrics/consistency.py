@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -14,7 +15,7 @@ from haltere.metrics.attitude import conjugate, multiply, rotation_vector, slerp
 from haltere.metrics.errors import reference_position
 from haltere.metrics.whiteness import assumed
 
-__all__ = ["BLOCKS", "DOF", "WINDOW", "NisSeries", "band", "nees_series", "nees_table", "nis_series", "nis_table"]
+__all__ = ["BLOCKS", "DOF", "WINDOW", "NisSeries", "band", "nees_series", "nees_table", "nis_series", "nis_table", "tested"]
 
 FloatArray = NDArray[np.float64]
 #: Blocks of the error state, in order.
@@ -47,15 +48,25 @@ def nis_table(solution: Solution) -> dict[str, dict[str, Any]]:
         if n == 0:
             continue
         ratio = (aids["innovation"][rows] / aids["innovation_sd"][rows]) ** 2
-        used = aids["status"][rows] == "fused"
+        used = tested(aids)[rows]
         out[str(sensor)] = {
             "mean": float(np.mean(ratio[used])) if used.any() else None,
             "band": list(band(1.0, max(int(used.sum()), 1))),
             "n": n,
             "rejected": int(np.count_nonzero(aids["status"][rows] == "rejected")),
             "deweighted": int(np.count_nonzero(aids["status"][rows] == "deweighted")),
+            "lost": float(1.0 - np.mean(np.minimum(aids["weight"][rows], 1.0))),
         }
     return out
+
+
+def tested(aids: Mapping[str, NDArray[Any]]) -> NDArray[np.bool_]:
+    """Which records say how true the filter's own variances are: what was fused, with its full weight or with less.
+
+    Those let in by force after a timeout are not among them: they are there because they do not fit.
+    """
+    status = aids["status"]
+    return np.asarray((status == "fused") | ((status == "deweighted") & (aids["reason"] != "timeout")))
 
 
 @dataclass(frozen=True)
@@ -69,15 +80,15 @@ class NisSeries:
 
 
 def nis_series(solution: Solution, window: int = WINDOW) -> dict[tuple[str, str], NisSeries]:
-    """Moving mean of the squared normalised innovations over ``window`` fused measurements, by sensor and quantity.
+    """Moving mean of the squared normalised innovations over ``window`` measurements, by sensor and quantity.
 
     The components of one measurement count as that many degrees of freedom: quantities are ``vel``, ``pos``, ``mag`` or a scalar's
-    own name. What was refused or de-weighted is left out as in `nis_table`, and so are assumptions and quantities with fewer
+    own name. What was refused or let in by force is left out as in `nis_table`, and so are assumptions and quantities with fewer
     measurements than the window.
     """
     a = solution.aids
     out: dict[tuple[str, str], NisSeries] = {}
-    good = (a["status"] == "fused") & (a["reason"] != "start") & (a["innovation_sd"] > 0.0) & np.isfinite(a["innovation"])
+    good = tested(a) & (a["reason"] != "start") & (a["innovation_sd"] > 0.0) & np.isfinite(a["innovation"])
     for sensor in (str(s) for s in np.unique(a["sensor"][good])):
         if assumed(sensor):
             continue

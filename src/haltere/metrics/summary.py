@@ -99,7 +99,7 @@ def _health(solution: Solution, flight: FlightLog) -> dict[str, dict[str, str]]:
         if sensor not in flight or sensor not in solution.summary["nis"]:
             continue
         nis = solution.summary["nis"][sensor]
-        bad = (nis["rejected"] + nis["deweighted"]) / nis["n"]
+        bad = nis["lost"]
         forced = any(e["kind"] == "timeout" and e["sensor"] == sensor for e in solution.events)
         if forced or bad > 0.2:
             verdict = "bad"
@@ -107,5 +107,5 @@ def _health(solution: Solution, flight: FlightLog) -> dict[str, dict[str, str]]:
             verdict = "doubtful"
         else:
             verdict = "good"
-        out[sensor] = {"verdict": verdict, "why": f"{100.0 * bad:.1f} % of {nis['n']} components refused or de-weighted"}
+        out[sensor] = {"verdict": verdict, "why": f"{100.0 * bad:.1f} % of the weight of {nis['n']} components refused or taken off"}
     return out

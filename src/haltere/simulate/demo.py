@@ -125,7 +125,7 @@ def demo_flight(
         },
         FlightMeta(
             name="demo", source=f"haltere demo, simulated, seed {seed}", start_utc=UTC, home=HOME,
-            noise={"magnetometer": NOISE_MAGNETOMETER, "barometer": NOISE_BARO},
+            noise={"magnetometer": NOISE_MAGNETOMETER, "field": 0.0, "barometer": NOISE_BARO, "gyro_scale": 0.0},
         ),
         ["simulated: a smooth path with white noise and bias walks of known size"],
     )  # fmt: skip

@@ -18,6 +18,7 @@ __all__ = [
     "ALIGNMENT",
     "BA",
     "BG",
+    "COMPASS_BINS",
     "CORE",
     "EVENT",
     "IMU_SAMPLE",
@@ -42,6 +43,8 @@ CORE = 15
 IMU_CAPACITY = 512
 MEASUREMENT_CAPACITY = 128
 EVENT_CAPACITY = 32
+#: Tenths of a second that the compass watch looks back, in a plain number: it is a modulus.
+COMPASS_BINS = constant(128)
 
 
 def _record(*fields: tuple[object, ...]) -> np.dtype[np.void]:
@@ -121,24 +124,97 @@ YAW_BANK = _record(
     ("fresh", "i8"),
     ("t", "f8"),
     ("n", "i8"),
+    ("corrected", "f8"),  # corrections of yaw that the hypotheses have followed [rad]
 )
 
-EVENT = _record(("t", "f8"), ("code", "i8"), ("sensor", "i8"), ("value", "f8"))
+#: One bin of the history of `haltere.aids.compass`.
+COMPASS_BIN = _record(
+    ("t", "f8"),
+    ("d", "f8"),  # turn that the compass shows and the gyro does not [rad]
+    ("drift", "f8"),  # integral of the vertical gyro bias in use [rad]
+    ("bias", "f8"),  # vertical gyro bias [rad/s]
+    ("pulled", "f8"),  # what the compass did to yaw [rad] and to the vertical gyro bias [rad/s], in all, and the integral of that
+    ("pulled_bias", "f8"),
+    ("pulled_drift", "f8"),
+    ("path", "f8"),  # integral of the rate's size [rad], and that size [rad/s]
+    ("rate", "f8"),
+    ("yaw_var", "f8"),
+    ("bias_var", "f8"),
+    ("q", "f8", 4),
+)
+
+#: What the compass watch remembers.
+COMPASS = _record(
+    ("out", "i8"),  # 0: heard, else what put it out
+    ("seen", "i8"),
+    ("known", "i8"),
+    ("strength", "f8"),  # field of the flight so far [uT], and its dip [rad]
+    ("dip", "f8"),
+    ("bad", "f8"),  # share of refused samples lately
+    ("slow", "f8"),  # smoothed innovation while out [rad]
+    ("onset", "f8"),
+    ("level", "f8"),
+    ("t_good", "f8"),
+    ("t_bad", "f8"),
+    ("t_last", "f8"),
+    ("t_before", "f8"),
+    ("t_bin", "f8"),
+    ("last", "f8"),
+    ("total", "f8"),
+    ("n", "i8"),
+    ("noise", "f8"),
+    ("drift", "f8"),
+    ("pulled", "f8"),
+    ("pulled_bias", "f8"),
+    ("pulled_drift", "f8"),
+    ("path", "f8"),
+    ("path_before", "f8"),
+    ("t_close", "f8"),
+    ("jump", "f8"),  # what put it out [rad], and the 1 sigma of yaw then
+    ("yaw_sd", "f8"),
+    ("head", "i8"),
+    ("filled", "i8"),
+    ("bin", COMPASS_BIN, (COMPASS_BINS,)),
+)
+
+#: What is known of the field of the motors' currents, see `haltere.aids.interference`.
+MOTORS = _record(
+    ("known", "i8"),
+    ("used", "i8"),
+    ("current", "f8"),  # battery current [A] and its time
+    ("t_load", "f8"),
+    ("reference", "f8"),  # current at alignment [A]
+    ("t_start", "f8"),
+    ("t_last", "f8"),
+    ("mean_u", "f8"),
+    ("mean_y", "f8", 3),
+    ("weight", "f8"),  # seconds remembered
+    ("sxx", "f8"),
+    ("sxy", "f8", 3),
+    ("syy", "f8", 3),
+    ("k", "f8", 3),  # [uT/A], and the 1 sigma of its length
+    ("sd", "f8"),
+)
+
+#: ``onset`` and ``threshold`` where there is one, else the time itself and NaN.
+EVENT = _record(("t", "f8"), ("onset", "f8"), ("code", "i8"), ("sensor", "i8"), ("value", "f8"), ("threshold", "f8"), ("detail", "i8"))
 
 #: Every number a filter is told. Field ``noise_gyro`` is configuration key ``noise.gyro``.
 PARAMETERS = np.dtype(
     [
         (name, "f8")
         for name in (
-            "noise_gyro noise_accel noise_gyro_bias noise_accel_bias noise_baro_bias "
+            "noise_gyro noise_gyro_scale noise_accel noise_gyro_bias noise_accel_bias noise_baro_bias "
             "noise_gnss_velocity noise_gnss_position noise_gnss_altitude noise_gnss_velocity_min noise_gnss_position_min "
-            "noise_barometer noise_magnetometer "
+            "noise_barometer noise_magnetometer noise_field noise_field_time "
             "noise_zero_velocity noise_zero_rate noise_fake_position noise_fake_position_rest noise_fake_velocity "
             "gate_gnss gate_barometer gate_magnetometer gate_zero_velocity gate_zero_rate "
-            "delay_gnss_velocity delay_gnss_position delay_barometer delay_magnetometer "
+            "delay_gnss_velocity delay_gnss_position delay_barometer delay_magnetometer delay_power "
             "aid_gnss aid_barometer aid_magnetometer aid_zero_velocity aid_zero_rate aid_fake_position aid_fake_velocity aid_yaw_bank "
+            "aid_compass_watch aid_motor_field "
             "timeout_gnss timeout_barometer timeout_magnetometer timeout_imu "
             "arm_gnss_x arm_gnss_y arm_gnss_z "
+            "robust_innovation robust_strength robust_dip robust_heading robust_calibration "
             "field_declination field_dip field_strength field_tolerance_strength field_tolerance_dip "
             "init_tilt_rest init_tilt_motion init_yaw_compass init_yaw_unknown init_gyro_bias_rest init_gyro_bias "
             "init_accel_bias init_velocity init_baro_bias "
@@ -209,16 +285,18 @@ def layout(baro: int = 0) -> np.dtype[np.void]:
             ("n_events", "i8"),
             ("n_events_lost", "i8"),
             ("event", EVENT, (EVENT_CAPACITY,)),
-            ("aid", AID_STATE, (8,)),
+            ("aid", AID_STATE, (9,)),
             ("rest", REST),
             ("yaw", YAW_BANK),
+            ("compass", COMPASS),
+            ("motors", MOTORS),
             ("align", ALIGNMENT),
             ("imu_head", "i8"),
             ("imu_n", "i8"),
             ("imu", IMU_SAMPLE, (IMU_CAPACITY,)),
-            ("ring_head", "i8", 4),
-            ("ring_n", "i8", 4),
-            ("ring", MEASUREMENT, (4, MEASUREMENT_CAPACITY)),
+            ("ring_head", "i8", 5),
+            ("ring_n", "i8", 5),
+            ("ring", MEASUREMENT, (5, MEASUREMENT_CAPACITY)),
         ],
         align=True,
     )

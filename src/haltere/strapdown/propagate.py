@@ -165,7 +165,9 @@ def propagate(s: Any, prm: Any, C: Mat, D: Mat, A: Mat, B: Mat, dt: float) -> No
     P = s.P
     qg, qbg = prm.noise_gyro * prm.noise_gyro, prm.noise_gyro_bias * prm.noise_gyro_bias
     qa, qba = prm.noise_accel * prm.noise_accel, prm.noise_accel_bias * prm.noise_accel_bias
-    q_theta, q_v, q_p = qg * dt + qbg * dt * dt * dt / 3.0, qa * dt, qa * dt * dt * dt / 3.0
+    turned = 3.0 - D[0][0] - D[1][1] - D[2][2]  # angle squared: what is wrong in proportion to the rate stays for about a second
+    q_theta = qg * dt + qbg * dt * dt * dt / 3.0 + prm.noise_gyro_scale * prm.noise_gyro_scale * turned / dt
+    q_v, q_p = qa * dt, qa * dt * dt * dt / 3.0
     for i in range(3):
         P[i, i] += q_theta
         P[3 + i, 3 + i] += q_v
