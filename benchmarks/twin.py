@@ -25,7 +25,7 @@ from haltere.estimators.base import InitialState
 from haltere.flight import config as configuration
 from haltere.flight.config import Config
 
-__all__ = ["Flight", "Twin", "build", "configuration_of", "fly", "missing"]
+__all__ = ["PLAIN", "Flight", "Twin", "build", "configuration_of", "fly", "missing"]
 
 FloatArray = NDArray[np.float64]
 
@@ -147,6 +147,12 @@ def fly(n: int = 100_000, rate: float = 1000.0, magnetometer: int = 10, baromete
     r[fixes] = 0.2**2
     order = np.lexsort((kind, stamp))
     return Flight(t, gyro, accel, kind[order], stamp[order], z[order], r[order], q, vel, pos, mag)
+
+
+#: What the twin does not have.
+PLAIN: dict[str, Any] = {
+    "noise__gyro_scale": 0.0, "noise__field": 0.0, "robust__innovation": 1e9, "aid__compass_watch": "off", "aid__motor_field": "off",
+}  # fmt: skip
 
 
 def configuration_of(estimator: str = "navigator", **keys: Any) -> Config:

@@ -53,7 +53,7 @@ def parameters() -> Any:
         "gate_gnss": 5.0, "gate_barometer": 5.0, "gate_magnetometer": 3.0, "gate_zero_velocity": 5.0, "gate_zero_rate": 5.0,
         "timeout_gnss": 7.0, "timeout_barometer": 7.0, "timeout_magnetometer": 10.0, "aid_magnetometer": 1.0, "init_baro_bias": 3.0,
         "arm_gnss_x": 0.3, "arm_gnss_y": -0.2, "arm_gnss_z": -0.5, "field_tolerance_strength": 0.35, "field_tolerance_dip": 20.0 * DEG,
-        "init_yaw_compass": 10.0 * DEG,
+        "init_yaw_compass": 10.0 * DEG, "robust_innovation": 1e9,
     }.items():  # fmt: skip
         prm[name] = value
     return prm

@@ -255,7 +255,7 @@ def test_nees_leaves_out_what_truth_does_not_know() -> None:
 
 
 def test_nis_of_drawn_innovations_is_one() -> None:
-    """By sensor, over what was fused; start values do not count, refused ones count as such only."""
+    """By sensor, over what was fused; start values do not count, those refused or let in by force count as such only."""
     rng = np.random.default_rng(5)
     n = 3000
     sd = rng.uniform(0.1, 3.0, n)
@@ -265,11 +265,14 @@ def test_nis_of_drawn_innovations_is_one() -> None:
         "innovation_sd": sd,
         "status": np.array(["fused"] * n, dtype=object).astype(str),
         "reason": np.array([""] * n).astype("<U12"),
+        "weight": np.ones(n),
     }
     aids["status"] = aids["status"].astype("<U12")
     baro = np.flatnonzero(aids["sensor"] == "barometer")
     aids["status"][baro[:40]], aids["innovation"][baro[:40]] = "rejected", 1e6
-    aids["status"][baro[40:70]], aids["innovation"][baro[40:70]] = "deweighted", 1e6
+    aids["status"][baro[40:70]], aids["innovation"][baro[40:70]], aids["reason"][baro[40:70]] = "deweighted", 1e6, "timeout"
+    aids["status"][baro[80:90]] = "deweighted"  # with less weight, but for no fault of its innovation
+    aids["weight"][baro[:40]], aids["weight"][baro[80:90]] = 0.0, 0.5
     aids["reason"][baro[70:80]], aids["innovation"][baro[70:80]] = "start", 1e6
     solution = Solution({"t": T}, aids, [], resolve())
     table = nis_table(solution)
@@ -278,7 +281,8 @@ def test_nis_of_drawn_innovations_is_one() -> None:
         low, high = band(1, m, 0.999)
         assert low < table[sensor]["mean"] < high
         assert table[sensor]["band"] == list(band(1, m))
-    assert [table["barometer"][k] for k in ("n", "rejected", "deweighted")] == [1990, 40, 30]
+    assert [table["barometer"][k] for k in ("n", "rejected", "deweighted")] == [1990, 40, 40]
+    assert table["barometer"]["lost"] == pytest.approx(45.0 / 1990.0)
     assert [table["gnss"][k] for k in ("n", "rejected", "deweighted")] == [1000, 0, 0]
     aids["status"][:] = "rejected"
     assert nis_table(solution)["gnss"]["mean"] is None
@@ -350,7 +354,7 @@ def test_health_is_read_off_the_innovations(bad: float, forced: bool, verdict: s
     n = 1000
     status = np.where(np.arange(n) < bad * n, "rejected", "fused")
     aids = {"sensor": np.full(n, "gnss"), "innovation": np.ones(n), "innovation_sd": np.ones(n), "status": status, "reason": np.full(n, "")}
-    aids |= {"t": 0.02 * np.arange(n), "component": np.full(n, "vel_n")}
+    aids |= {"t": 0.02 * np.arange(n), "component": np.full(n, "vel_n"), "weight": np.where(status == "fused", 1.0, 0.0)}
     events = [{"kind": "timeout", "sensor": "gnss"}] if forced else []
     solution = solution_of(T, TURN, OFFSET_V, OFFSET_P)
     solution.aids, solution.events = aids, events

@@ -35,7 +35,7 @@ def test_the_twin_gives_the_same_numbers(keys: dict[str, float | str]) -> None:
     """20 000 samples at 1 kHz with every sensor: rows agree to 1e-9 of their size, and so does what was fused and refused."""
     _need_compiler()
     flight = twin.fly(20_000)
-    config = twin.configuration_of(**WITHOUT, **keys)
+    config = twin.configuration_of(**WITHOUT, **twin.PLAIN, **keys)
     S, prm = new_state(config, flight.initial()), parameters(config)
     n = len(flight.t)
     rows, cov = np.zeros((n + 2000, 37)), np.empty((kernels.COVARIANCE_ROWS, 1000))

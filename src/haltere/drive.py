@@ -26,6 +26,7 @@ from haltere.flight.door import Checked, check, fit
 from haltere.flight.local import geodetic_from_local
 from haltere.flight.log import FlightLog
 from haltere.flight.solution import Solution
+from haltere.metrics.disturbance import describe, disturbances
 from haltere.metrics.summary import summarise
 from haltere.strapdown.layout import IMU_CAPACITY
 
@@ -34,6 +35,8 @@ __all__ = ["run", "usable"]
 FloatArray = NDArray[np.float64]
 #: IMU samples between two looks at progress, and room for aid records between two drains.
 CHUNK, AID_ROOM = 20000, 60000
+#: What a disturbed compass may be instead: a compass that turns against the gyro is as well a gyro that turns against the compass.
+CANDIDATES = {OUT_TURN: ["magnetometer", "gyro.z"], OUT_FIELD: ["magnetometer"], OUT_APART: ["magnetometer"]}
 
 
 def run(
@@ -136,6 +139,8 @@ def run(
         solution.smoothed = Solution(table, solution.aids, events, resolved, {}, _covariance(back_cov, back_cov.shape[1]))
         if lost:
             facts["warnings"].append(f"smoothed: {lost} times the covariance could not be inverted; what is before was smoothed by itself")
+    if scored and disturbances(solution.events):
+        describe(solution, shown, _unwatched(resolved, initial, t, gyro, accel, offered, solution.t))
     summarise(solution, shown, facts, scored)
     for name, stream in flight.streams.items():  # as read, before anything was left out
         solution.summary["streams"][name]["n"] = len(stream)
@@ -192,6 +197,17 @@ def _loop(
     return columns[:, :filled], parts, events, np.concatenate(nodes) if nodes else tape
 
 
+def _unwatched(
+    config: Config, initial: InitialState | None, t: FloatArray, gyro: FloatArray, accel: FloatArray, m: Measurements, at: FloatArray
+) -> FloatArray:
+    """Heading [rad] at the times ``at`` (k,) of the same filter hearing its compass to the end: what a disturbance would have done."""
+    deaf = config.changed(aid__compass_watch="off")
+    rows = _loop(new_state(deaf, initial), parameters(deaf), t, gyro, accel, m, np.empty((kernels.COVARIANCE_ROWS, 0)), None, False)[0]
+    w, x, y, z = rows[1:5]
+    yaw = np.unwrap(np.arctan2(2.0 * (x * y + w * z), w * w + x * x - y * y - z * z))
+    return np.asarray(np.interp(at, rows[0], yaw)) if rows.shape[1] else np.full(len(at), np.nan)
+
+
 def _drain(S: NDArray[np.void], aids: NDArray[np.void], parts: list[NDArray[np.void]], events: list[dict[str, Any]]) -> None:
     """Move records and events out of the buffers of fixed size."""
     if S["n_aids"][0]:
@@ -207,7 +223,7 @@ def _drain(S: NDArray[np.void], aids: NDArray[np.void], parts: list[NDArray[np.v
 
 def _event(kind: str, sensor: str, record: np.void, bank: bool) -> dict[str, Any]:
     t, value, threshold = float(record["t"]), float(record["value"]), float(record["threshold"])
-    code = int(value) if math.isfinite(value) else 0
+    code, detail = int(value) if math.isfinite(value) else 0, int(record["detail"])
     turned, allowed = f"{math.degrees(value):.0f} deg", f"{math.degrees(threshold):.0f} deg"
     how = {1: "at rest", 2: "in motion, from GNSS velocity", 3: "from gravity alone", 4: "in motion, from two turns of GNSS velocity"}
     evidence = {
@@ -218,7 +234,7 @@ def _event(kind: str, sensor: str, record: np.void, bank: bool) -> dict[str, Any
             OUT_TURN: f"the compass turned by {turned} against the gyro; {allowed} are allowed",
             OUT_FIELD: "strength or dip of the field are not those of before, or not the Earth's",
             OUT_APART: f"the compass is {turned} off the heading that everything else holds; {allowed} are allowed",
-        }.get(int(record["detail"]), ""),
+        }.get(detail, ""),
         "recovered": f"agrees again, {value:.1f} s after the onset",
         "timeout": f"refused for {value:.1f} s, let in again at the gate's edge",
         "gap": f"{value:.2f} s without IMU samples",
@@ -226,8 +242,8 @@ def _event(kind: str, sensor: str, record: np.void, bank: bool) -> dict[str, Any
     }.get(kind, kind)
     return {
         "sensor": sensor, "axis": None, "kind": kind, "t_onset": float(record["onset"]), "t_detected": t, "t_isolated": None,
-        "t_recovered": None, "candidates": [], "statistic": value, "threshold": threshold if math.isfinite(threshold) else None,
-        "evidence": evidence,
+        "t_recovered": None, "candidates": CANDIDATES.get(detail, []) if kind == "disturb" else [], "statistic": value,
+        "threshold": threshold if math.isfinite(threshold) else None, "evidence": evidence,
     }  # fmt: skip
 
 
