@@ -19,6 +19,7 @@ from haltere._jit import as_records
 from haltere.aids import compass, interference
 from haltere.aids.record import R_DIP, R_DISTURBED, R_NONE, R_STRENGTH
 from haltere.drive import run
+from haltere.errors import UsageError
 from haltere.estimators.base import Estimator
 from haltere.estimators.inputs import parameters
 from haltere.filter import robust
@@ -251,6 +252,50 @@ def test_robust_handling_costs_nothing_on_clean_flights() -> None:
             t, e = error_series(solution, flight["truth"])["yaw"]
             squares[name] += float(np.mean(e[t > 10.0] ** 2))
     assert math.sqrt(squares["on"] / squares["off"]) < 1.05
+
+
+# The offset of the magnetometer as slow states
+
+
+def test_an_offset_is_found_in_flight() -> None:
+    """Hard iron of 5 uT an axis, 20 flights: found within the stated uncertainty, and the compass is heard where else it is put out."""
+    heard = {"on": 0.0, "off": 0.0}
+    z = []
+    for seed in range(20):
+        flight = haltere.simulate(
+            haltere.Scenario(
+                vehicle="hummingbird", mission="tour", duration=90.0, seed=seed, wind={"n": 3.0, "gust": 1.0},
+                sensors={"imu": {"rate": 125.0}, "magnetometer": {"hard_iron": 5.0}},
+            )
+        )  # fmt: skip
+        mag, truth = flight["magnetometer"], flight["truth"]
+        true = np.array([np.mean(mag[f"mag_{a}"] - np.interp(mag.t, truth.t, truth[f"field_{a}"])) for a in "xyz"])
+        for word in heard:
+            solution = run(flight, set={"magnetometer.refine": word})
+            heard[word] += float(np.mean(solution.aids["status"][solution.aids["sensor"] == "magnetometer"] != "rejected")) / 20.0
+            if word == "on":
+                found, sd = (np.array([solution[f"{n}_{a}"][-1] for a in "xyz"]) for n in ("mag_offset", "sd_mag_offset"))
+                z.append((found - true) / sd)
+            else:
+                assert "mag_offset_x" not in solution.table
+    assert np.abs(z).max() < 3.0
+    assert heard["on"] > 0.95
+    assert heard["off"] < heard["on"] - 0.1
+
+
+def test_an_offset_leaves_tilt_alone() -> None:
+    """Roll and pitch of a run that estimates the offset are those of one without a compass, in flight with GNSS."""
+    flight = demo_flight(21, 40.0, imu_rate=100.0)
+    refined, deaf = run(flight, set={"magnetometer.refine": "on"}), run(flight, set={"aid.magnetometer": "off"})
+    series = {name: error_series(s, flight["truth"]) for name, s in (("refined", refined), ("deaf", deaf))}
+    for axis in ("roll", "pitch"):
+        a, b = (series[n][axis][1][-500:] for n in ("refined", "deaf"))
+        assert float(np.degrees(np.abs(a - b)).max()) < 0.3
+
+
+def test_what_cannot_be_smoothed_yet_is_refused() -> None:
+    with pytest.raises(UsageError, match=r"magnetometer\.refine"):
+        run(demo_flight(1, 30.0, imu_rate=50.0), set={"magnetometer.refine": "on"}, smooth=True)
 
 
 # The field of the motors

@@ -101,6 +101,8 @@ def run(
         raise UsageError("a positive number of rows a second", repr(rate), "--rate")
     began = time.perf_counter()
     asked = request(flight, estimator, preset, config, set)
+    if smooth and asked["magnetometer.refine"] == "on":
+        raise UsageError("magnetometer.refine=off with a smoothed run", "on", "--smooth", "the smoother does not know those states yet")
     flight = correct(flight, asked.values)
     blind = flight.without("onboard", "truth")
     checked = check(blind, upright=estimator != "ahrs", given=asked.values)
@@ -168,7 +170,7 @@ def _loop(
 
     The last of what comes back is the tape for smoothing, empty where none is wanted.
     """
-    width = int(kernels.row_width(S["baro"].shape[1]))
+    width = int(kernels.row_width(S["baro"].shape[1], S["mag"].shape[1]))
     columns = np.empty((width, len(t)))
     chunk = np.empty((CHUNK + 4 * IMU_CAPACITY, width))
     aids = as_records(np.empty(AID_ROOM, AID_RECORD))
@@ -273,6 +275,10 @@ def _table(rows: FloatArray, S: NDArray[np.void], position: bool) -> dict[str, F
         if baro:
             np.sqrt(rows[36], out=rows[36])
             out["sd_baro_bias"] = rows[36]
+    if S["mag"].shape[1]:
+        k = 35 + 2 * baro
+        out |= {f"mag_offset_{a}": rows[k + i] for i, a in enumerate("xyz")}
+        out |= {f"sd_mag_offset_{a}": np.sqrt(rows[k + 3 + i]) for i, a in enumerate("xyz")}
     return out
 
 

@@ -175,15 +175,15 @@ def fuse_offer(s: Any, aids: Any, t: float, sensor: int, offer: Offer) -> None:
 def project_gain(s: Any, only: bool) -> None:
     """Keep of the gain in ``s.k`` only what turns about the vertical, or all but that.
 
-    Only: K_θ <- d (dᵀ K_θ), K_bg likewise, the rest zero; else K_θ <- K_θ - d (dᵀ K_θ), K_bg likewise. d = Cᵀ e3 is the vertical in the
-    body frame (theory-amendments.md §1).
+    Only: K_θ <- d (dᵀ K_θ), K_bg likewise, the rest zero but for a magnetometer's offset; else K_θ <- K_θ - d (dᵀ K_θ), K_bg likewise.
+    d = Cᵀ e3 is the vertical in the body frame (theory-amendments.md §1).
     """
     d = dcm((s.q[0], s.q[1], s.q[2], s.q[3]))[2]
     k = s.k
     a = d[0] * k[0] + d[1] * k[1] + d[2] * k[2]
     b = d[0] * k[9] + d[1] * k[10] + d[2] * k[11]
     if only:
-        for i in range(s.P.shape[0]):
+        for i in range(15 + len(s.baro)):  # an offset of the magnetometer keeps its gain
             k[i] = 0.0
         for i in range(3):
             k[i] = a * d[i]

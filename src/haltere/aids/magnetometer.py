@@ -96,6 +96,12 @@ def offer(s: Any, prm: Any, m: Any, aids: Any) -> Offer:
     if prm.aid_motor_field > 0.0 and s.has_field == 1:
         interference.learn(s, m.t, z, field_n(s), C)
         z = interference.cleaned(s, z)
+    spread = 0.0  # what the offset may still be, as a part of the field
+    for i in range(len(s.mag)):
+        o = 15 + len(s.baro) + i
+        spread = max(spread, 3.0 * math.sqrt(s.P[o, o]) / s.field[2])
+    if len(s.mag) > 0:
+        z = (z[0] - s.mag[0], z[1] - s.mag[1], z[2] - s.mag[2])
     mu = mat_vec(C, z)
     a = s.aid[MAGNETOMETER]
     horizontal = math.sqrt(mu[0] * mu[0] + mu[1] * mu[1])
@@ -103,9 +109,9 @@ def offer(s: Any, prm: Any, m: Any, aids: Any) -> Offer:
         learn_field(s, mu, s.field[0])
     reason, weight = R_NONE, 1.0
     strength, dip = norm(z), math.atan2(mu[2], horizontal)
-    if abs(strength / s.field[2] - 1.0) > prm.field_tolerance_strength:
+    if abs(strength / s.field[2] - 1.0) > prm.field_tolerance_strength + spread:
         reason = R_STRENGTH
-    elif abs(dip - s.field[1]) > prm.field_tolerance_dip:
+    elif abs(dip - s.field[1]) > prm.field_tolerance_dip + spread:
         reason = R_DIP
     elif horizontal < 0.2 * s.field[2] * math.cos(s.field[1]):
         reason = R_HORIZONTAL
@@ -133,7 +139,7 @@ def offer(s: Any, prm: Any, m: Any, aids: Any) -> Offer:
         shared = 1.0 + slow / (white + slow) * max(2.0 * prm.noise_field_time / since - 1.0, 0.0)
     s.compass.t_before = m.t
     robust = (IGG3, prm.robust_innovation, weight, shared)
-    if prm.aid_magnetometer == 2.0:
+    if prm.aid_magnetometer == 2.0 or len(s.mag) > 0:
         return offer_axes(s, prm, C, z, white + slow, timeout, reason, robust)
     row = ((THETA, heading_row(C, s.field[0], s.field[1])), NONE, NONE)
     r = (white + slow) / max(horizontal * horizontal, 1e-6)
@@ -145,11 +151,24 @@ def offer(s: Any, prm: Any, m: Any, aids: Any) -> Offer:
 
 @jit
 def offer_axes(s: Any, prm: Any, C: Mat, z: Vec, r: float, timeout: float, reason: int, robust: Robust) -> Offer:
-    """Three axes: h = Cᵀ m_n, H_θ = [Cᵀ m_n]× (theory.md §2.1, §3.6)."""
+    """Three axes: h = Cᵀ m_n [+ b], H_θ = [Cᵀ m_n]× (theory.md §2.1, §3.6) [and H_b = I]; ``z`` [uT] is without the offset b.
+
+    With the offset as states tilt is left alone: only the turn about the vertical and the offset move.
+    """
     h = tmat_vec(C, field_n(s))
     H = (
         ((THETA, (0.0, -h[2], h[1])), NONE, NONE),
         ((THETA, (h[2], 0.0, -h[0])), NONE, NONE),
         ((THETA, (-h[1], h[0], 0.0)), NONE, NONE),
     )
-    return THREE, C_MAG, z, h, (r, r, r), H, prm.gate_magnetometer, timeout, reason, ANY_TURN, robust
+    turn = ANY_TURN
+    if len(s.mag) > 0:
+        o = 13 + len(s.baro)  # a block that begins two columns before its last
+        H = (
+            ((THETA, (0.0, -h[2], h[1])), (o, (0.0, 0.0, 1.0)), NONE),
+            ((THETA, (h[2], 0.0, -h[0])), (o + 1, (0.0, 0.0, 1.0)), NONE),
+            ((THETA, (-h[1], h[0], 0.0)), (o + 2, (0.0, 0.0, 1.0)), NONE),
+        )
+        if prm.aid_magnetometer != 2.0:
+            turn = ONLY_TURN
+    return THREE, C_MAG, z, h, (r, r, r), H, prm.gate_magnetometer, timeout, reason, turn, robust

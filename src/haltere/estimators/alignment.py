@@ -237,6 +237,10 @@ def start(s: Any, prm: Any, kind: int, f_b: Vec, a_n: Vec) -> None:
     for i in range(len(s.baro)):
         s.baro[i] = s.baro_start
         P[15 + i, 15 + i] = prm.init_baro_bias * prm.init_baro_bias
+    o = 15 + len(s.baro)
+    for i in range(len(s.mag)):
+        s.mag[i] = 0.0
+        P[o + i, o + i] = prm.init_mag_offset * prm.init_mag_offset
     for k2 in range(len(s.aid)):
         s.aid[k2].t_passed = s.t
         s.aid[k2].t_due = s.t

@@ -115,7 +115,7 @@ class InitialState:
 
 def new_state(config: Config, initial: InitialState | None = None) -> NDArray[np.void]:
     """State record, one element, that has seen nothing yet."""
-    record = as_records(np.zeros(1, layout(1 if config["baro.offset"] == "on" else 0)))
+    record = as_records(np.zeros(1, layout(1 if config["baro.offset"] == "on" else 0, 3 if config["magnetometer.refine"] == "on" else 0)))
     record["q"][0, 0] = 1.0
     home = (config.number("home.lat"), config.number("home.lon"), config.number("home.alt"))
     record["gravity"] = STANDARD_GRAVITY

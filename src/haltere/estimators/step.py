@@ -52,9 +52,9 @@ RATE_MAX, FORCE_MAX = 100.0, 500.0
 
 
 @entry
-def row_width(n_baro: int) -> int:
-    """Columns of the output rows: t, q 4, v 3, p 3, bg 3, ba 3, baro; P_θθ upper triangle 6, other variances 12, baro."""
-    return 35 + 2 * n_baro
+def row_width(n_baro: int, n_mag: int = 0) -> int:
+    """Columns of the output rows: t, q 4, v 3, p 3, bg 3, ba 3, baro; P_θθ upper triangle 6, other variances 12, baro; mag, its own."""
+    return 35 + 2 * n_baro + 2 * n_mag
 
 
 @jit
@@ -85,6 +85,10 @@ def write_row(s: Any, rows: Any) -> None:
     for j in range(len(s.baro)):
         rows[i, 35 + j] = s.baro[j]
         rows[i, 35 + len(s.baro) + j] = P[15 + j, 15 + j]
+    o, k = 15 + len(s.baro), 35 + 2 * len(s.baro)
+    for j in range(len(s.mag)):
+        rows[i, k + j] = s.mag[j]
+        rows[i, k + len(s.mag) + j] = P[o + j, o + j]
     s.n_rows = i + 1
 
 

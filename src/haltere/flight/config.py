@@ -91,6 +91,7 @@ KEYS: dict[str, Key] = {
         2.5, "uT", "What surroundings and calibration add to the field, 1 sigma, alike in all samples of a correlation time.", low=0.0
     ),
     "noise.field_time": _positive(2.0, "s", "That correlation time."),
+    "noise.mag_offset": _positive(0.02, "uT/sqrt(s)", "Walk of the magnetometer's offset, where it is estimated."),
     "noise.zero_velocity": _positive(0.05, "m/s", "Zero velocity at rest, 1 sigma at 10 Hz."),
     "noise.zero_rate": _positive(0.01, "rad/s", "Zero rate at rest, 1 sigma at 10 Hz."),
     "noise.fake_position": _positive(10.0, "m", "Fake position in flight, 1 sigma at 5 Hz."),
@@ -159,6 +160,7 @@ KEYS: dict[str, Key] = {
     "init.accel_bias": _positive(0.2, "m/s^2", "1 sigma of the accelerometer bias."),
     "init.velocity": _positive(0.3, "m/s", "Least 1 sigma of velocity."),
     "init.baro_bias": _positive(3.0, "m", "1 sigma of the barometer offset."),
+    "init.mag_offset": _positive(5.0, "uT", "1 sigma of the magnetometer's offset, where it is estimated."),
     "rest.gyro": _positive(0.02, "rad/s", "At rest the rate's standard deviation over a second is below this."),
     "rest.accel": _positive(0.3, "m/s^2", "At rest the standard deviation of |f| over a second is below this."),
     "rest.gravity": _positive(0.5, "m/s^2", "At rest mean |f| differs from gravity by less than this."),
@@ -167,6 +169,9 @@ KEYS: dict[str, Key] = {
         math.nan, "K", "Air temperature at the ground, scales pressure altitude. Default: standard atmosphere.", low=200.0, high=330.0
     ),
     "baro.offset": _switch("on", "Estimate the barometer offset as a state."),
+    "magnetometer.refine": _switch(
+        "off", "Estimate the magnetometer's offset (hard iron) as slow states; tilt is left alone all the same."
+    ),
     "unit.time": _unit("s", "What the log's time stamps are in, in every stream."),
     "unit.gyro": _unit("rad/s", "What the log's angular rates are in."),
     "unit.accel": _unit("m/s^2", "What the log's specific forces are in."),

@@ -65,6 +65,8 @@ SOLUTION: tuple[Column, ...] = (
     *_ned("sd_pos", "m", "1 sigma of position"),
     *_xyz("sd_gyro_bias", "rad/s", "FRD", "1 sigma of the gyro bias"),
     *_xyz("sd_accel_bias", "m/s^2", "FRD", "1 sigma of the accelerometer bias"),
+    *_xyz("mag_offset", "uT", "FRD", "estimated offset of the magnetometer"),
+    *_xyz("sd_mag_offset", "uT", "FRD", "1 sigma of the magnetometer's offset"),
     Column("sd_baro_bias", "m", "", "1 sigma of the barometer offset"),
     *_ned("sd_wind", "m/s", "1 sigma of wind"),
 )

@@ -206,7 +206,7 @@ PARAMETERS = np.dtype(
         for name in (
             "noise_gyro noise_gyro_scale noise_accel noise_gyro_bias noise_accel_bias noise_baro_bias "
             "noise_gnss_velocity noise_gnss_position noise_gnss_altitude noise_gnss_velocity_min noise_gnss_position_min "
-            "noise_barometer noise_magnetometer noise_field noise_field_time "
+            "noise_barometer noise_magnetometer noise_field noise_field_time noise_mag_offset "
             "noise_zero_velocity noise_zero_rate noise_fake_position noise_fake_position_rest noise_fake_velocity "
             "gate_gnss gate_barometer gate_magnetometer gate_zero_velocity gate_zero_rate "
             "delay_gnss_velocity delay_gnss_position delay_barometer delay_magnetometer delay_power "
@@ -217,7 +217,7 @@ PARAMETERS = np.dtype(
             "robust_innovation robust_strength robust_dip robust_heading robust_calibration "
             "field_declination field_dip field_strength field_tolerance_strength field_tolerance_dip "
             "init_tilt_rest init_tilt_motion init_yaw_compass init_yaw_unknown init_gyro_bias_rest init_gyro_bias "
-            "init_accel_bias init_velocity init_baro_bias "
+            "init_accel_bias init_velocity init_baro_bias init_mag_offset "
             "rest_gyro rest_accel rest_gravity "
             "imu_mean horizon covariance_interval"
         ).split()
@@ -227,20 +227,22 @@ PARAMETERS = np.dtype(
 
 
 @cache
-def layout(baro: int = 0) -> np.dtype[np.void]:
+def layout(baro: int = 0, mag: int = 0) -> np.dtype[np.void]:
     """State record type.
 
     Parameters
     ----------
     baro
         1 with the barometer offset as a state, else 0.
+    mag
+        3 with the offset of the magnetometer as states, else 0.
 
     Returns
     -------
     numpy.dtype
         Nominal state, covariance ``P`` (n, n), scratch, queues, monitors and counters: the whole memory of a filter.
     """
-    n = CORE + baro
+    n = CORE + baro + mag
     return np.dtype(
         [
             ("t", "f8"),
@@ -250,6 +252,7 @@ def layout(baro: int = 0) -> np.dtype[np.void]:
             ("bg", "f8", 3),
             ("ba", "f8", 3),
             ("baro", "f8", (baro,)),
+            ("mag", "f8", (mag,)),  # offset of the magnetometer in the body frame [uT]
             ("P", "f8", (n, n)),
             ("dx", "f8", n),
             ("u", "f8", n),

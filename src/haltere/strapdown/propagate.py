@@ -176,6 +176,9 @@ def propagate(s: Any, prm: Any, C: Mat, D: Mat, A: Mat, B: Mat, dt: float) -> No
         P[12 + i, 12 + i] += qba * dt
     for i in range(len(s.baro)):
         P[15 + i, 15 + i] += prm.noise_baro_bias * prm.noise_baro_bias * dt
+    o = 15 + len(s.baro)
+    for i in range(len(s.mag)):
+        P[o + i, o + i] += prm.noise_mag_offset * prm.noise_mag_offset * dt
     if dt > 0.02:  # below that the off-diagonal blocks are lost in the noise (theory-amendments.md §8)
         for i in range(3):
             c = -0.5 * qbg * dt * dt
@@ -207,6 +210,9 @@ def inject(s: Any) -> None:
         s.ba[i] += dx[12 + i]
     for i in range(len(s.baro)):
         s.baro[i] += dx[15 + i]
+    o = 15 + len(s.baro)
+    for i in range(len(s.mag)):
+        s.mag[i] += dx[o + i]
     for j in range(n):
         c = cross(t, (P[0, j], P[1, j], P[2, j]))
         P[0, j] -= 0.5 * c[0]
