@@ -344,7 +344,7 @@ def test_no_motors_field_is_found_where_there_is_none(monkeypatch: pytest.Monkey
 
 def test_cleaning_is_the_regression_turned_round() -> None:
     """With k found from exact data, what is left is the field at the current of alignment."""
-    s, _ = hovering()
+    s, prm = hovering()
     s["t"] = 0.0
     interference.forget(s)
     k = np.array([0.3, -0.2, 0.5])
@@ -356,7 +356,7 @@ def test_cleaning_is_the_regression_turned_round() -> None:
         if i % 5 == 0:
             current = 10.0 if i == 0 else 10.0 + 8.0 * float(rng.random())
         interference.hear(s, t, current)
-        interference.learn(s, t, tuple(h + k * current), tuple(h), tuple(tuple(map(float, r)) for r in C))  # type: ignore[arg-type]
+        interference.learn(s, prm, t, tuple(h + k * current), tuple(h), tuple(tuple(map(float, r)) for r in C))  # type: ignore[arg-type]
     assert s["motors"]["used"] == 1
     np.testing.assert_allclose(s["motors"]["k"], k, rtol=1e-9)
     np.testing.assert_allclose(interference.cleaned(s, tuple(h + k * current)), h + 10.0 * k, rtol=1e-9)  # type: ignore[arg-type]

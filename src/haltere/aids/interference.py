@@ -43,7 +43,16 @@ def hear(s: Any, t: float, current: float) -> None:
 
 
 @jit
-def learn(s: Any, t: float, m_b: Vec, h_n: Vec, C: Mat) -> None:
+def use(s: Any, prm: Any, used: bool) -> None:
+    """Begin or end to take the field off: the watch does not take that for a turn, and an offset that was found is open again."""
+    s.motors.used, s.compass.seen = (1 if used else 0), 0
+    o = 15 + len(s.baro)
+    for i in range(len(s.mag)):
+        s.P[o + i, o + i] += prm.init_mag_offset * prm.init_mag_offset
+
+
+@jit
+def learn(s: Any, prm: Any, t: float, m_b: Vec, h_n: Vec, C: Mat) -> None:
     """Take a magnetometer sample [uT, body], uncorrected, into the regression; ``h_n`` is the reference field [uT, NED].
 
     k = Σ u'y'/Σ u'² of the quick parts u', y' of load and field residual; its covariance from the residuals' variance, with as many
@@ -89,9 +98,9 @@ def learn(s: Any, t: float, m_b: Vec, h_n: Vec, C: Mat) -> None:
     moved = math.sqrt(strength) * spread / norm(h_n)
     sure = strength > SIGMAS * SIGMAS * variance and moved > WORTH
     if i.used == 0 and sure and t - i.t_start > EARLIEST:
-        i.used, s.compass.seen = 1, 0  # the watch does not take what begins here for a turn of the compass
+        use(s, prm, True)
     elif i.used == 1 and strength < 0.25 * SIGMAS * SIGMAS * variance:
-        i.used, s.compass.seen = 0, 0
+        use(s, prm, False)
 
 
 @jit

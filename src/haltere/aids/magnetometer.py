@@ -94,7 +94,7 @@ def offer(s: Any, prm: Any, m: Any, aids: Any) -> Offer:
     z = (m.z[0], m.z[1], m.z[2])
     C = dcm((s.q[0], s.q[1], s.q[2], s.q[3]))
     if prm.aid_motor_field > 0.0 and s.has_field == 1:
-        interference.learn(s, m.t, z, field_n(s), C)
+        interference.learn(s, prm, m.t, z, field_n(s), C)
         z = interference.cleaned(s, z)
     spread = 0.0  # what the offset may still be, as a part of the field
     for i in range(len(s.mag)):

@@ -68,7 +68,8 @@ def describe(solution: Solution, flight: FlightLog, unwatched: FloatArray | None
             words.append("it follows " + " and ".join(follows))
         if "pos_n" in solution.table:
             at = np.array([np.interp(e["t_onset"], solution.t, solution[f"pos_{k}"]) for k in "ned"])
-            words.append(f"began at {at[0]:.0f} m north, {at[1]:.0f} m east, {-at[2]:.0f} m up")
+            north, east, up = (round(float(x)) + 0 for x in (at[0], at[1], -at[2]))
+            words.append(f"began at {north} m north, {east} m east, {up} m up")
             again = [f"{t0:.1f}" for t0, p in places if float(np.linalg.norm(p - at)) < SAME_PLACE]
             if again:
                 words.append(f"the place of that at {', '.join(again)} s")

@@ -123,7 +123,7 @@ def biases(c: Context) -> Section | None:
     """Biases of gyro, accelerometer and barometer with 1σ."""
     groups = [(f"gyro_bias_{a}", f"gyro {a} [deg/s]", "deg/s", DEG, 1e-4) for a in "xyz"]
     groups += [(f"accel_bias_{a}", f"accel. {a} [m/s²]", "m/s²", 1.0, 1e-4) for a in "xyz"]
-    groups += [("baro_bias", "barometer [m]", "m", 1.0, 1e-3)]
+    groups += [("baro_bias", "barometer [m]", "m", 1.0, 1e-3), *((f"mag_offset_{a}", f"magnet. {a} [µT]", "µT", 1.0, 1e-3) for a in "xyz")]
     groups = [g for g in groups if g[0] in c.solution]
     if not groups:
         return None

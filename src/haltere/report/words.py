@@ -11,6 +11,7 @@ import numpy as np
 from haltere.flight.log import FlightLog
 from haltere.flight.schema import base_name
 from haltere.flight.solution import Solution
+from haltere.metrics.disturbance import disturbances
 from haltere.report.context import Context, Episode, sensor_label
 from haltere.report.series import Pool
 
@@ -79,9 +80,14 @@ def verdict(c: Context) -> Verdict:
     torn = [e for e in solution.events if e["kind"] == "gap" and (e.get("statistic") or 0.0) > 1.0]
     found = summary.get("findings", [])
     ill = list(dict.fromkeys(_unit_label(f) for f in found if base_name(f["stream"]) == f["stream"]))  # further units are not used
-    worst = 2 if by_level["bad"] or broken else 1 if by_level["doubtful"] or lost or drifting or torn or ill else 0
+    compass = disturbances(solution.events)
+    alone = compass and by_level["bad"] == ["magnetometer"] and not by_level["doubtful"] and compass[0]["t_onset"] > solution.t[0] + 2.0
+    worst = 2 if (by_level["bad"] and not alone) or broken else 1 if by_level["doubtful"] or lost or drifting or torn or ill or alone else 0
     if broken:
         headline = f"The filter broke down {count(len(broken), 'time')}: read what follows with that in mind."
+    elif alone:
+        times = f" {len(compass)} times" if len(compass) > 1 else ""
+        headline = f"The compass was disturbed{times}, first at t = {compass[0]['t_onset']:.1f} s; the heading was held without it."
     elif by_level["bad"] or by_level["doubtful"]:
         named = [sensor_label(s) for s in (*by_level["bad"], *by_level["doubtful"])]
         headline = f"Not all sensors fit: {_list(named)} {'disagree' if len(named) > 1 else 'disagrees'} with the rest."
