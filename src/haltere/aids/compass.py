@@ -29,7 +29,7 @@ from haltere.core.rotation import Mat, Vec, dcm, quat_from_rotvec, quat_mul, qua
 from haltere.filter.robust import IGG3, inflate
 from haltere.strapdown.layout import COMPASS_BINS
 
-__all__ = ["OUT_APART", "OUT_FIELD", "OUT_TURN", "attribute", "forget", "level", "observe", "shown"]
+__all__ = ["OUT_APART", "OUT_FIELD", "OUT_TURN", "attribute", "forget", "level", "observe", "shown", "unsee"]
 
 #: A bin of the history [s], and the smoothing of innovations while the compass is out [s].
 BIN, SLOW = 0.1, 2.0
@@ -117,6 +117,16 @@ def yaw_sd(s: Any) -> float:
 def back(c: Any, k: int) -> int:
     """Place in the ring of the bin k bins before the newest."""
     return (c.head - 1 - k) % COMPASS_BINS
+
+
+@jit
+def unsee(s: Any, t: float) -> None:
+    """Forget the samples since t."""
+    c = s.compass
+    c.n, c.total = 0, 0.0
+    while c.filled > 0 and c.bin[back(c, 0)].t > t:
+        c.head = (c.head - 1) % COMPASS_BINS
+        c.filled -= 1
 
 
 @jit
@@ -254,8 +264,20 @@ def come_back(s: Any, prm: Any, t: float, fair: bool, C: Mat) -> None:
 
 
 @jit
-def observe(s: Any, prm: Any, t: float, e: float, weight: float, C: Mat) -> int:
-    """Take one sample into the watch: its heading innovation [rad] and the weight of strength and dip; the reason to refuse it."""
+def observe(s: Any, prm: Any, t: float, e: float, weight: float, steady: bool, C: Mat) -> int:
+    """Take one sample into the watch, and give the reason to refuse it.
+
+    Parameters
+    ----------
+    e
+        Innovation of heading [rad].
+    weight
+        What strength and dip leave it; 0 refused.
+    steady
+        Whether it may speak of the compass: not while something known disturbs it.
+    C
+        C_nb.
+    """
     c = s.compass
     fair = weight > 0.0
     turned = e + s.yaw_corrected
@@ -275,10 +297,11 @@ def observe(s: Any, prm: Any, t: float, e: float, weight: float, C: Mat) -> int:
     c.pulled_drift += c.pulled_bias * dt
     c.path += math.sqrt(s.w[0] * s.w[0] + s.w[1] * s.w[1] + s.w[2] * s.w[2]) * dt
     c.t_last = t
-    c.bad += min(1.0, dt / BAD_SPAN) * ((0.0 if fair else 1.0) - c.bad)
+    if steady:
+        c.bad += min(1.0, dt / BAD_SPAN) * ((0.0 if fair else 1.0) - c.bad)
     if weight < 1.0:
         c.t_bad = t
-    if fair:
+    if fair and steady:
         c.total += c.last
         c.n += 1
         c.slow += min(1.0, dt / SLOW) * (e - c.slow)

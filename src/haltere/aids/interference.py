@@ -12,9 +12,10 @@ import math
 from typing import Any
 
 from haltere._jit import jit
+from haltere.aids import compass
 from haltere.core.rotation import Mat, Vec, norm, tmat_vec
 
-__all__ = ["cleaned", "forget", "hear", "learn"]
+__all__ = ["UNSURE", "cleaned", "forget", "hear", "learn", "unsure"]
 
 #: Slowest variation that counts, memory of the regression [s], and how long a current is believed without a new sample [s].
 SLOW, MEMORY, STALE = 5.0, 120.0, 1.0
@@ -23,6 +24,8 @@ SLOW, MEMORY, STALE = 5.0, 120.0, 1.0
 SIGMAS, WORTH, EARLIEST = 8.0, 0.01, 10.0
 #: Residuals are alike for about this long [s]: samples within it are one.
 ALIKE = 0.5
+#: Part of the field that a change of the current may move unseen.
+UNSURE = 0.04
 
 
 @jit
@@ -39,7 +42,10 @@ def forget(s: Any) -> None:
 def hear(s: Any, t: float, current: float) -> None:
     """Take a battery current [A]."""
     i = s.motors
-    i.current, i.t_load = current, t
+    before = i.t_load
+    i.change, i.current, i.t_load = current - i.current, current, t
+    if unsure(s) > UNSURE * s.field[2]:
+        compass.unsee(s, before)  # what was cleaned with a current that was no longer true
 
 
 @jit
@@ -101,6 +107,15 @@ def learn(s: Any, prm: Any, t: float, m_b: Vec, h_n: Vec, C: Mat) -> None:
         use(s, prm, True)
     elif i.used == 1 and strength < 0.25 * SIGMAS * SIGMAS * variance:
         use(s, prm, False)
+
+
+@jit
+def unsure(s: Any) -> float:
+    """Field [uT] that may be left because the current has changed since it was measured: as much as it did from the sample before."""
+    i = s.motors
+    if i.used == 0:
+        return 0.0
+    return norm((i.k[0], i.k[1], i.k[2])) * abs(i.change)
 
 
 @jit

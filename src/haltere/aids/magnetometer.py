@@ -124,15 +124,17 @@ def offer(s: Any, prm: Any, m: Any, aids: Any) -> Offer:
             event(s, m.t, E_RESET, MAGNETOMETER, heading)
             record(s, aids, m.t, MAGNETOMETER, C_HEADING, heading, 0.0, prm.init_yaw_compass, 0.0, 1.0, FUSED, R_START)
             return NOTHING
+    unsure = interference.unsure(s)
     timeout = prm.timeout_magnetometer
     if prm.aid_compass_watch > 0.0 and a.started > 0:
         timeout = NO_TIMEOUT  # the watch says when the compass is to be heard again
         if reason == R_NONE:
             weight, reason = compass.level(s, prm, strength, dip, m.t - s.compass.t_last)
-        watched = compass.observe(s, prm, m.t, heading, weight if reason == R_NONE else 0.0, C)
+        watched = compass.observe(s, prm, m.t, heading, weight if reason == R_NONE else 0.0, unsure < interference.UNSURE * s.field[2], C)
         if reason == R_NONE:
             reason = watched
     white, slow = prm.noise_magnetometer * prm.noise_magnetometer, prm.noise_field * prm.noise_field
+    weight *= (white + slow) / (white + slow + unsure * unsure)
     shared = 1.0
     if slow > 0.0:  # within its correlation time an error is the same in every sample: together they are worth one
         since = max(m.t - s.compass.t_before, 1e-3)

@@ -154,7 +154,7 @@ def _code(values: FloatArray, resolution: float) -> _Coded:
     if len(usable):
         low, high = np.percentile(usable, [5.0, 95.0])
         spread = float(high - low) or float(np.max(np.abs(usable)))
-        wanted = min(resolution, spread / 2000.0) if spread > 0.0 else resolution
+        wanted = max(min(resolution, spread / 2000.0), 1e-300) if spread > 0.0 else resolution
         largest = max(float(np.max(np.abs(usable))), 1e-300)
         scale = 10.0 ** min(math.ceil(-math.log10(wanted)), 15 - math.ceil(math.log10(largest)), 300)
     steps = np.rint(usable * scale).astype(np.int64)

@@ -181,7 +181,8 @@ COMPASS = _record(
 MOTORS = _record(
     ("known", "i8"),
     ("used", "i8"),
-    ("current", "f8"),  # battery current [A] and its time
+    ("current", "f8"),  # battery current [A], its last change, and its time
+    ("change", "f8"),
     ("t_load", "f8"),
     ("reference", "f8"),  # current at alignment [A]
     ("t_start", "f8"),
