@@ -176,7 +176,7 @@ def _loop(
     aids = as_records(np.empty(AID_ROOM, AID_RECORD))
     parts: list[NDArray[np.void]] = []
     events: list[dict[str, Any]] = []
-    tape = np.empty((len(chunk) if smooth else 0, node_width(S["P"].shape[1], S["baro"].shape[1])))
+    tape = np.empty((2 * len(chunk) if smooth else 0, node_width(S["P"].shape[1], S["baro"].shape[1])))
     nodes: list[FloatArray] = []
     filled = 0
 

@@ -73,10 +73,13 @@ def due(s: Any, prm: Any, sensor: int, w: Vec, f: Vec) -> bool:
 
 
 @jit
-def fuse_all(s: Any, prm: Any, aids: Any, dt: float, w: Vec, f: Vec) -> None:
-    """Fuse every queued measurement valid at or before the state's time, sensor by sensor, then the pseudo-measurements due."""
-    sensor = GNSS_VELOCITY
-    while sensor < N_SENSORS:
+def fuse_all(s: Any, prm: Any, aids: Any, dt: float, w: Vec, f: Vec, first: int, end: int) -> None:
+    """Fuse every queued measurement valid at or before the state's time, sensor by sensor, then the pseudo-measurements due.
+
+    Only of sensors ``first`` ... ``end`` - 1.
+    """
+    sensor = first
+    while sensor < end:
         i, t = 0, s.t
         if sensor < N_QUEUED:
             i = pop_due(s, sensor, s.t)

@@ -6,10 +6,10 @@ from typing import Any
 
 from haltere._jit import jit
 from haltere.aids.fusing import ANY_TURN, HARD, NO_GATE, NO_TIMEOUT, NO_TURN, THREE, ZEROS, Offer, unit_rows
-from haltere.aids.record import C_POS, C_VEL, GNSS_POSITION, MAGNETOMETER, R_NONE
+from haltere.aids.record import C_POS, C_VEL, FAKE_POSITION, FAKE_VELOCITY, GNSS_POSITION, MAGNETOMETER, R_NONE
 from haltere.strapdown.layout import POS, VEL
 
-__all__ = ["offer_position", "offer_velocity", "position_is_lost"]
+__all__ = ["blind_to_heading", "offer_position", "offer_velocity", "position_is_lost"]
 
 
 @jit
@@ -29,6 +29,14 @@ def turn_allowed(s: Any, prm: Any) -> int:
     """
     a = s.aid[MAGNETOMETER]
     return ANY_TURN if a.started > 0 and s.t - a.t_passed < prm.timeout_magnetometer else NO_TURN
+
+
+@jit
+def blind_to_heading(s: Any, prm: Any) -> bool:
+    """Whether an assumption is due now that may not turn the heading: see `haltere.estimators.smoother`."""
+    velocity = prm.aid_fake_velocity > 0.0 and s.t >= s.aid[FAKE_VELOCITY].t_due
+    position = prm.aid_fake_position > 0.0 and s.t >= s.aid[FAKE_POSITION].t_due and position_is_lost(s)
+    return (velocity or position) and turn_allowed(s, prm) == NO_TURN
 
 
 @jit

@@ -7,7 +7,7 @@ from typing import Any
 from haltere._jit import jit
 from haltere.core.rotation import Mat
 
-__all__ = ["multiply", "solve", "turn_block"]
+__all__ = ["multiply", "solve", "solve_any", "turn_attitude", "turn_block"]
 
 
 @jit
@@ -40,6 +40,35 @@ def solve(w: Any) -> bool:
             for j in range(m + 4):
                 R[i, m + j] -= f * r[j]
     for i in range(n):
+        w.mu[i] = R[i, 2 * m]
+    return True
+
+
+@jit
+def solve_any(w: Any) -> bool:
+    """Like `solve`, of a first matrix that need not be symmetric: with pivots, and slower."""
+    R, m = w.system.P, w.W.shape[0]
+    for k in range(m):
+        p = k
+        for i in range(k + 1, m):
+            if abs(R[i, k]) > abs(R[p, k]):
+                p = i
+        if not abs(R[p, k]) > 0.0:
+            return False
+        for j in range(2 * m + 4):
+            R[k, j], R[p, j] = R[p, j], R[k, j]
+        d = 1.0 / R[k, k]
+        for j in range(2 * m + 4):
+            R[k, j] *= d
+        for i in range(m):
+            f = R[i, k]
+            if i != k:
+                for j in range(2 * m + 4):
+                    R[i, j] -= f * R[k, j]
+    for i in range(m):
+        for j in range(m):
+            w.W[i, j] = R[i, m + j]
+    for i in range(len(w.mu)):
         w.mu[i] = R[i, 2 * m]
     return True
 
@@ -84,6 +113,20 @@ def multiply(w: Any, A: Any, B: Any, out: Any, symmetric: bool) -> None:
         for i in range(m):
             for j in range(i):
                 out[i, j] = out[j, i]
+
+
+@jit
+def turn_attitude(P: Any, M: Mat) -> None:
+    """P <- M P Mᵀ, where M is one but for the block of attitude."""
+    n = P.shape[0]
+    for j in range(n):
+        a, b, c = P[0, j], P[1, j], P[2, j]
+        for i in range(3):
+            P[i, j] = M[i][0] * a + M[i][1] * b + M[i][2] * c
+    for j in range(n):
+        a, b, c = P[j, 0], P[j, 1], P[j, 2]
+        for i in range(3):
+            P[j, i] = M[i][0] * a + M[i][1] * b + M[i][2] * c
 
 
 @jit

@@ -4,11 +4,21 @@ Between two nodes of the tape (a posterior after fusion) the filter's prediction
 again, so that only posteriors are kept. Just before the fusion that ends an interval, μ = P⁻¹ (x̂ˢ ⊟ x̂); over a step of prediction
 μ <- Φᵀ μ, whatever its process noise, and x̂ˢ = x̂ ⊞ P μ at each row. At the node Pˢ = P + Wᵀ (Pˢ' - P') W with W = P'⁻¹ Φ P, where Φ is
 that of the whole interval and P', Pˢ' are those at its end: one factorisation an interval. It needs no gains and no innovations, so
-that refused, de-weighted and masked updates, and yaw set anew, are what the filter made of them.
+that refused and de-weighted updates, and yaw set anew, are what the filter made of them. Before a correction was injected at the
+node, errors of attitude are turned by it: Pˢ' is turned back first, without which a heading known to 60° only spoils the tilt.
 
-The smoothed covariance is continuous in time, also where a measurement was fused. At rows between nodes, which lie at most
-`haltere.estimators.step.NODE_SPAN` apart, it is taken as linear between theirs, the block of attitude in axes that do not turn; where
-nothing comes after, it is the filter's.
+What this states is true for any gain: x - x̂ - Wᵀ (x' - x̂') is uncorrelated with x' - x̂' and all noise after it. But only
+optimal gains make it the best, and smaller than the filter's. Under a masked gain K = M P Hᵀ/S what was fused is not all kept: the
+state at the end, carried back, may be worse than what was known then. For a compass that may only turn the heading that costs next to
+nothing. For assumptions that may not turn it (`haltere.aids.fake`), where nothing else holds the filter, it costs all. They tell the
+past nothing instead: what comes after is a measurement of x with information Y, whatever was assumed in between, so that before them
+Pˢ⁻¹ = P⁻⁻¹ + Y where Pˢ⁻¹ = P⁺⁻¹ + Y after them (Fraser and Potter 1969), with P⁻ from a node of its own. With x̂ˢ = x̂ + P μ and
+Pˢ = P - P Λ P: Λ⁻ = (1 + Λ⁺ (P⁻ - P⁺))⁻¹ Λ⁺ and μ⁻ = (1 + Λ⁺ (P⁻ - P⁺))⁻¹ (μ⁺ + Λ⁺ (x̂⁺ ⊟ x̂⁻)), also without any inverse of Y. So a
+filter that only assumptions hold has nothing to be smoothed with, and its smoothed course is its own.
+
+The smoothed covariance is continuous in time but for that, also where a measurement was fused. At rows between nodes, which lie at
+most `haltere.estimators.step.NODE_SPAN` apart, it is taken as linear between theirs and at most the filter's, the block of attitude
+in axes that do not turn; where nothing comes after, it is the filter's.
 """
 
 from __future__ import annotations
@@ -21,9 +31,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from haltere._jit import as_records, entry, jit
-from haltere.core.rotation import Vec, dcm, quat_from_rotvec, quat_mul, quat_unit
-from haltere.estimators.dense import multiply, solve, turn_block
-from haltere.estimators.step import COVARIANCE_ROWS, LONG_STEP, SUB_STEP, bridge_push, interval
+from haltere.core.rotation import Mat, Quat, Vec, cross, dcm, quat_from_rotvec, quat_mul, quat_unit
+from haltere.estimators.dense import multiply, solve, solve_any, turn_attitude, turn_block
+from haltere.estimators.step import ASSUMED, COVARIANCE_ROWS, LONG_STEP, SUB_STEP, bridge_push, interval
 from haltere.strapdown.propagate import left_F, mechanise, propagate, transition
 
 __all__ = ["BUFFER", "node_width", "smooth", "smoothed"]
@@ -32,6 +42,8 @@ FloatArray = NDArray[np.float64]
 
 #: Predictions between two nodes at most: those of `haltere.estimators.step.NODE_STEPS`, one of them through a gap.
 BUFFER = 160
+#: Corrections from here on [rad] are no injections of `haltere.strapdown.propagate`: yaw was set anew, and P is not turned with it.
+TURNED = 0.3
 #: Columns of a node before the upper triangle of P: time, whether a stretch begins here, gravity, q 4, v 3, p 3, bg 3, ba 3.
 NODE_HEAD = 19
 
@@ -55,7 +67,7 @@ def _workspace(n: int, n_baro: int) -> np.dtype[np.void]:
             ("x", "f8", (b, 16 + n_baro)), ("P", "f8", (b, m, m)), ("phi", "f8", (b, 3, 3, 3)), ("dt", "f8", b), ("row", "i8", b),
             ("system", system), ("W", "f8", (m, m)), ("D", "f8", (m, m)), ("T", "f8", (m, m)),
             ("first", "f8", (m, m)), ("last", "f8", (m, m)), ("between", "f8", (m, m)), ("turned", "f8", (3, 3, 3)),
-            ("r", "f8", 2 * m + 4), ("mu", "f8", n), ("d", "f8", n), ("xs", "f8", 16 + n_baro),
+            ("r", "f8", 2 * m + 4), ("mu", "f8", n), ("later", "f8", n), ("d", "f8", n), ("xs", "f8", 16 + n_baro),
         ],
         align=True,
     )  # fmt: skip
@@ -199,10 +211,39 @@ def difference(w: Any, k: int) -> None:
 
 
 @jit
-def enter(w: Any, k: int) -> bool:
-    """μ at the end of an interval of k predictions and Pˢ at both ends, from the smoothed node; False where P cannot be inverted."""
+def injected(w: Any, k: int, q: Quat) -> Vec:
+    """Half the rotation vector that was injected between the k-th prediction and a posterior ``q``; nothing if more than `TURNED`."""
+    x = w.x[k]
+    d = quat_mul((x[0], -x[1], -x[2], -x[3]), q)
+    size = math.sqrt(d[1] * d[1] + d[2] * d[2] + d[3] * d[3])
+    half = math.atan2(size, abs(d[0]))
+    if half > 0.5 * TURNED:
+        return (0.0, 0.0, 0.0)
+    c = (half / size if size > 1e-12 else 1.0) * (1.0 if d[0] >= 0.0 else -1.0)
+    return (c * d[1], c * d[2], c * d[3])
+
+
+@jit
+def unturn(half: Vec) -> Mat:
+    """What turns an attitude error after an injection into one before it: (1 - ½[δθ]×)⁻¹, see `haltere.strapdown.propagate.inject`."""
+    a, b, e = half
+    r = 1.0 / (1.0 + a * a + b * b + e * e)
+    return (
+        (r * (1.0 + a * a), r * (a * b - e), r * (a * e + b)),
+        (r * (a * b + e), r * (1.0 + b * b), r * (b * e - a)),
+        (r * (a * e - b), r * (b * e + a), r * (1.0 + e * e)),
+    )
+
+
+@jit
+def enter(w: Any, k: int, after: Any) -> bool:
+    """μ at the end of an interval of k predictions and Pˢ at both ends, from the node ``after`` it, smoothed.
+
+    False where P cannot be inverted.
+    """
     m, R = w.W.shape[0], w.system.P
     difference(w, k)
+    turn_attitude(w.first, unturn(injected(w, k, (after[3], after[4], after[5], after[6]))))
     for i in range(m):
         for j in range(m):
             w.last[i, j] = w.first[i, j]
@@ -222,6 +263,82 @@ def enter(w: Any, k: int) -> bool:
     turn_block(w.first, dcm((x[0], x[1], x[2], x[3])), w.turned[0])
     turn_block(w.last, dcm((y[0], y[1], y[2], y[3])), w.turned[1])
     return True
+
+
+@jit
+def load_system(w: Any, A: Any, B: Any) -> None:
+    """``w.system`` <- A | B."""
+    m, R = w.W.shape[0], w.system.P
+    for i in range(m):
+        for j in range(m):
+            R[i, j] = A[i, j]
+            R[i, m + j] = B[i, j]
+
+
+@jit
+def past(s: Any, w: Any, node: Any) -> bool:
+    """Go from a posterior back to the ``node`` before its assumptions, which tell the past nothing; see the head of the module.
+
+    The posterior is the 0-th prediction with ``w.mu`` and ``w.first``; False where a matrix cannot be inverted, and then nothing that
+    comes after is used before.
+    """
+    m, n, R = w.W.shape[0], len(w.mu), w.system.P
+    for i in range(len(w.xs)):
+        w.xs[i] = w.x[0, i]
+    for i in range(m):
+        for j in range(m):
+            w.P[1, i, j] = w.P[0, i, j]
+            w.D[i, j] = w.P[0, i, j] - w.first[i, j]
+    load_node(s, node)
+    keep(s, w, 0)
+    difference(w, 0)
+    half = injected(w, 0, (w.xs[0], w.xs[1], w.xs[2], w.xs[3]))
+    M = unturn(half)
+    turn_attitude(w.P[1], M)
+    turn_attitude(w.D, M)
+    for i in range(n):
+        R[i, 2 * m] = 0.0
+        w.later[i] = w.mu[i]
+    turned = cross(half, (w.mu[0], w.mu[1], w.mu[2]))
+    for i in range(3):
+        w.later[i] += turned[i]
+    load_system(w, w.P[1], w.D)
+    ok = solve(w)  # P⁻¹ (P - Pˢ)
+    if ok:
+        for i in range(m):
+            for j in range(m):
+                w.T[i, j] = w.W[j, i]
+            R[i, 2 * m] = 0.0
+        load_system(w, w.P[1], w.T)
+        ok = solve(w)  # Λ = P⁻¹ (P - Pˢ) P⁻¹
+    if ok:
+        for i in range(m):
+            for j in range(m):
+                w.T[i, j] = 0.5 * (w.W[i, j] + w.W[j, i])
+                w.D[i, j] = w.P[0, i, j] - w.P[1, i, j]
+        multiply(w, w.T, w.D, w.W, False)
+        for i in range(m):
+            w.W[i, i] += 1.0
+        load_system(w, w.W, w.T)
+        for i in range(n):
+            R[i, 2 * m] = w.later[i]
+            for j in range(n):
+                R[i, 2 * m] += w.T[i, j] * w.d[j]
+        ok = solve_any(w)  # (1 + Λ (P⁻ - P))⁻¹ times Λ, and times μ + Λ (x̂ ⊟ x̂⁻)
+    if not ok:
+        for i in range(n):
+            w.mu[i] = 0.0
+    for i in range(m):
+        for j in range(m):
+            w.first[i, j] = 0.0
+    if ok:
+        multiply(w, w.W, w.P[0], w.T, False)
+        multiply(w, w.P[0], w.T, w.first, True)
+    for i in range(m):
+        for j in range(m):
+            w.first[i, j] = w.P[0, i, j] - w.first[i, j]
+    corrected(w, 0)
+    return ok
 
 
 @jit
@@ -252,6 +369,12 @@ def blend(w: Any, k: int, c: float, whole: bool) -> None:
                 P[i, j] = first[i, j] + c * (last[i, j] - first[i, j])
     for i in range(3, m):
         P[i, i] = first[i, i] + c * (last[i, i] - first[i, i])
+        if P[i, i] > w.P[k, i, i]:
+            shrink = math.sqrt(w.P[k, i, i] / P[i, i])
+            for j in range(m if whole else 0):
+                P[i, j] *= shrink
+                P[j, i] *= shrink
+            P[i, i] = w.P[k, i, i]
     for i in range(3):
         for j in range(3):
             w.turned[2, i, j] = w.turned[0, i, j] + c * (w.turned[1, i, j] - w.turned[0, i, j])
@@ -335,10 +458,14 @@ def smooth(
     for j in range(len(nodes) - 1, -1, -1):
         a = node_row[j]
         final = j == len(nodes) - 1 or nodes[j + 1, 1] > 0.0
+        if not final and nodes[j + 1, 1] == ASSUMED:
+            if not past(s, w, nodes[j]):
+                lost += 1
+            continue
         b = last_row[j] if final else node_row[j + 1]
         load_node(s, nodes[j])
         count = forward(s, prm, w, t, gyro, accel, a, b)
-        if not final and not enter(w, count):
+        if not final and not enter(w, count, nodes[j + 1]):
             lost += 1
             final = True
             count -= 1  # the row of the node after has been written

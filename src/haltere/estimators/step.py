@@ -6,12 +6,13 @@ import math
 from typing import Any
 
 from haltere._jit import entry, jit
-from haltere.aids import rest
-from haltere.aids.dispatch import fuse_all
+from haltere.aids import fake, rest
+from haltere.aids.dispatch import N_SENSORS, fuse_all
 from haltere.aids.record import (
     BAROMETER,
     E_DIVERGED,
     E_GAP,
+    FAKE_POSITION,
     GNSS_POSITION,
     GNSS_VELOCITY,
     MAGNETOMETER,
@@ -25,6 +26,7 @@ from haltere.filter.queue import pop_imu, push, push_imu
 from haltere.strapdown.propagate import predict
 
 __all__ = [
+    "ASSUMED",
     "COVARIANCE_ROWS",
     "LONG_STEP",
     "NODE_SPAN",
@@ -47,6 +49,8 @@ COVARIANCE_ROWS = 1 + 5 * 6 + 1
 LONG_STEP, SUB_STEP = 0.1, 0.05
 #: A tape for smoothing has a node after each fusion, at least after so many predictions, and about every so many seconds.
 NODE_STEPS, NODE_SPAN = 64, 0.05
+#: What a node says of itself: a stretch begins, it follows a prediction, or only assumptions that tell the past nothing came before it.
+BEGINS, FOLLOWS, ASSUMED = 1.0, 0.0, -1.0
 #: No sensor measures more [rad/s, m/s^2].
 RATE_MAX, FORCE_MAX = 100.0, 500.0
 
@@ -113,13 +117,13 @@ def write_covariance(s: Any, prm: Any, cov: Any) -> None:
 
 
 @jit
-def write_node(s: Any, tape: Any, begins: bool) -> None:
+def write_node(s: Any, tape: Any, kind: float) -> None:
     """Append a posterior to the tape for smoothing, where there is one: see `haltere.estimators.smoother.load_node`."""
     i = s.n_nodes
     if i >= tape.shape[0]:
         return
     node = tape[i]
-    node[0], node[1], node[2] = s.t, 1.0 if begins else 0.0, s.gravity
+    node[0], node[1], node[2] = s.t, kind, s.gravity
     for j in range(4):
         node[3 + j] = s.q[j]
     for j in range(3):
@@ -234,7 +238,7 @@ def advance(s: Any, prm: Any, rows: Any, cov: Any, aids: Any, tape: Any) -> None
         s.t = t
         write_row(s, rows)
         write_covariance(s, prm, cov)
-        write_node(s, tape, True)
+        write_node(s, tape, BEGINS)
         return
     if dt > prm.timeout_imu:  # too long to bridge: align anew
         event(s, t, E_GAP, NO_SENSOR, dt)
@@ -260,9 +264,9 @@ def advance(s: Any, prm: Any, rows: Any, cov: Any, aids: Any, tape: Any) -> None
             s.n_unaligned += 1
             return
         s.t_covariance = t
-        begins, node = True, True
+        node, kind = True, BEGINS
     else:
-        begins, node = False, dt > LONG_STEP or t >= s.t_wake or s.n_since >= NODE_STEPS - 1 or s.n_since * dt >= NODE_SPAN
+        node, kind = dt > LONG_STEP or t >= s.t_wake or s.n_since >= NODE_STEPS - 1 or s.n_since * dt >= NODE_SPAN, FOLLOWS
         s.n_since += 1
         north, east = s.v[0], s.v[1]
         if dt > LONG_STEP:
@@ -272,11 +276,15 @@ def advance(s: Any, prm: Any, rows: Any, cov: Any, aids: Any, tape: Any) -> None
         s.yaw.dv[0] += s.v[0] - north
         s.yaw.dv[1] += s.v[1] - east
         if t >= s.t_wake:
-            fuse_all(s, prm, aids, dt, w1, f1)
-        if s.yaw.fresh == 1:
-            s.yaw.fresh = 0
-            if prm.aid_yaw_bank > 0.0:
-                yaw_bank.update(s, s.yaw.z[0], s.yaw.z[1], s.yaw.r)
+            for part in range(2):  # what is measured, then what is assumed; one call, since with a second one it is compiled twice
+                if part == 1 and fake.blind_to_heading(s, prm):
+                    write_node(s, tape, FOLLOWS)
+                    kind = ASSUMED
+                fuse_all(s, prm, aids, dt, w1, f1, FAKE_POSITION * part, FAKE_POSITION + (N_SENSORS - FAKE_POSITION) * part)
+                if s.yaw.fresh == 1:
+                    s.yaw.fresh = 0
+                    if prm.aid_yaw_bank > 0.0:
+                        yaw_bank.update(s, s.yaw.z[0], s.yaw.z[1], s.yaw.r)
     if t >= s.t_covariance and not sound(s):
         event(s, t, E_DIVERGED, NO_SENSOR, 0.0)
         alignment.begin(s, t)
@@ -285,7 +293,7 @@ def advance(s: Any, prm: Any, rows: Any, cov: Any, aids: Any, tape: Any) -> None
     write_row(s, rows)
     write_covariance(s, prm, cov)
     if node:
-        write_node(s, tape, begins)
+        write_node(s, tape, kind)
 
 
 @jit
