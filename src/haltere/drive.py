@@ -176,8 +176,10 @@ def _loop(
     aids = as_records(np.empty(AID_ROOM, AID_RECORD))
     parts: list[NDArray[np.void]] = []
     events: list[dict[str, Any]] = []
-    tape = np.empty((2 * len(chunk) if smooth else 0, node_width(S["P"].shape[1], S["baro"].shape[1])))
-    nodes: list[FloatArray] = []
+    # room for all nodes of most flights, so that nothing need be copied: a node a measurement, some a second beside; more makes more tapes
+    room = len(m.t) + int(60.0 * (t[-1] - t[0])) + 8 * IMU_CAPACITY if smooth else 0
+    tape = np.empty((room, node_width(S["P"].shape[1], S["baro"].shape[1])))
+    tapes: list[FloatArray] = []
     filled = 0
 
     def drain() -> None:
@@ -186,9 +188,10 @@ def _loop(
         columns[:, filled : filled + n] = chunk[:n].T
         filled += n
         S["n_rows"] = 0
-        nodes.append(tape[: int(S["n_nodes"][0])].copy())
-        S["n_nodes"] = 0
         _drain(S, aids, parts, events)
+        if S["n_nodes"][0] > room - 4 * IMU_CAPACITY:
+            tapes.append(tape[: int(S["n_nodes"][0])].copy())
+            S["n_nodes"] = 0
 
     i = j = 0
     while i < len(t) or S["imu_n"][0] > 0:
@@ -196,7 +199,8 @@ def _loop(
         drain()
         if progress is not None:
             progress(i / len(t))
-    return columns[:, :filled], parts, events, np.concatenate(nodes) if nodes else tape
+    nodes = tape[: int(S["n_nodes"][0])]
+    return columns[:, :filled], parts, events, np.concatenate([*tapes, nodes]) if tapes else nodes
 
 
 def _unwatched(

@@ -67,7 +67,7 @@ def _workspace(n: int, n_baro: int) -> np.dtype[np.void]:
             ("x", "f8", (b, 16 + n_baro)), ("P", "f8", (b, m, m)), ("phi", "f8", (b, 3, 3, 3)), ("dt", "f8", b), ("row", "i8", b),
             ("system", system), ("W", "f8", (m, m)), ("D", "f8", (m, m)), ("T", "f8", (m, m)),
             ("first", "f8", (m, m)), ("last", "f8", (m, m)), ("between", "f8", (m, m)), ("turned", "f8", (3, 3, 3)),
-            ("r", "f8", 2 * m + 4), ("mu", "f8", n), ("later", "f8", n), ("d", "f8", n), ("xs", "f8", 16 + n_baro),
+            ("r", "f8", (4, 2 * m + 4)), ("mu", "f8", n), ("later", "f8", n), ("d", "f8", n), ("xs", "f8", 16 + n_baro),
         ],
         align=True,
     )  # fmt: skip
@@ -254,11 +254,14 @@ def enter(w: Any, k: int, after: Any) -> bool:
         R[i, 2 * m] = w.d[i]
     if not solve(w):
         return False
-    multiply(w, w.D, w.W, w.T, False)
-    multiply(w, w.W, w.T, w.first, True)
+    multiply(w, w.D, w.W, w.T)
+    multiply(w, w.W, w.T, w.first)
     for i in range(m):
-        for j in range(m):
+        for j in range(i, m):  # as symmetric as P
             w.first[i, j] += w.P[0, i, j]
+    for i in range(m):
+        for j in range(i):
+            w.first[i, j] = w.first[j, i]
     x, y = w.x[0], w.x[k]
     turn_block(w.first, dcm((x[0], x[1], x[2], x[3])), w.turned[0])
     turn_block(w.last, dcm((y[0], y[1], y[2], y[3])), w.turned[1])
@@ -316,7 +319,7 @@ def past(s: Any, w: Any, node: Any) -> bool:
             for j in range(m):
                 w.T[i, j] = 0.5 * (w.W[i, j] + w.W[j, i])
                 w.D[i, j] = w.P[0, i, j] - w.P[1, i, j]
-        multiply(w, w.T, w.D, w.W, False)
+        multiply(w, w.T, w.D, w.W)
         for i in range(m):
             w.W[i, i] += 1.0
         load_system(w, w.W, w.T)
@@ -332,11 +335,12 @@ def past(s: Any, w: Any, node: Any) -> bool:
         for j in range(m):
             w.first[i, j] = 0.0
     if ok:
-        multiply(w, w.W, w.P[0], w.T, False)
-        multiply(w, w.P[0], w.T, w.first, True)
+        multiply(w, w.W, w.P[0], w.T)
+        multiply(w, w.P[0], w.T, w.first)
     for i in range(m):
-        for j in range(m):
+        for j in range(i, m):
             w.first[i, j] = w.P[0, i, j] - w.first[i, j]
+            w.first[j, i] = w.first[i, j]
     corrected(w, 0)
     return ok
 

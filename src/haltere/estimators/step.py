@@ -420,7 +420,13 @@ def run_chunk(
         Next IMU sample and next measurement.
     """
     s, prm = S[0], PRM[0]
-    while s.n_aids <= len(aids) - 2048 and s.n_events <= len(s.event) - 8 and s.n_rows <= rows.shape[0] - 2 * len(s.imu):
+    room = 4 * len(s.imu)
+    while (
+        s.n_aids <= len(aids) - 2048
+        and s.n_events <= len(s.event) - 8
+        and s.n_rows <= rows.shape[0] - 2 * len(s.imu)
+        and (tape.shape[0] == 0 or s.n_nodes <= tape.shape[0] - room)
+    ):
         if behind(s, prm) or (i == len(t) and s.imu_n > 0):  # the one call of `advance` here: with a second one it is compiled twice
             advance(s, prm, rows, cov, aids, tape)
         elif i < i_end:
