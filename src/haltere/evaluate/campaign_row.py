@@ -14,7 +14,7 @@ from haltere.flight.log import FlightLog, Stream
 from haltere.flight.solution import Solution
 from haltere.metrics.consistency import BLOCKS, nees_series
 from haltere.metrics.detection import STATE_CHANGES, Detections, detections
-from haltere.metrics.errors import ANGLES, VECTORS, Series, error_series, lengths, settling_time, since
+from haltere.metrics.errors import ANGLES, VECTORS, Series, error_series, largest, lengths, rms, settling_time, since
 
 __all__ = ["BOUNDS", "ERRORS", "FAULT_COLUMNS", "METRICS", "OPEN", "row_of"]
 
@@ -79,9 +79,8 @@ def row_of(
         series = _in_units(series | lengths(series))
         scored = since(series, begin + settle)
         for name in (n for n in ERRORS if n in scored):
-            e = scored[name][1]
-            row[f"{name}.rms"] = float(np.sqrt(np.mean(e * e)))
-            row[f"{name}.max"] = float(np.max(np.abs(e)))
+            row[f"{name}.rms"] = rms(scored[name][1])
+            row[f"{name}.max"] = largest(scored[name][1])
         for name, bound in bounds.items():
             if name in series:
                 row[f"{name}.settling"] = settling_time(*series[name], bound, begin)
@@ -137,7 +136,7 @@ def _faults(found: Detections, series: Series, bounds: Mapping[str, float]) -> l
         during = since(series, start, end)
         for name, bound in bounds.items():
             if name in during:
-                row[f"{name}.max"] = float(np.max(np.abs(during[name][1])))
+                row[f"{name}.max"] = largest(during[name][1])
             if name in series and math.isfinite(end):
                 row[f"{name}.recovery"] = settling_time(*series[name], bound, end)
         out.append(row)

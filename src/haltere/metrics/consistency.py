@@ -113,6 +113,38 @@ def _moving_sum(x: FloatArray, window: int) -> FloatArray:
     return np.asarray(np.lib.stride_tricks.sliding_window_view(x, window).sum(axis=1))
 
 
+#: What `nees_series` reads of a truth.
+_READ = ("q_", "vel_", "pos_", "gyro_bias_", "accel_bias_", "baro_bias", "lat", "lon", "alt")
+
+
+def _around(truth: Stream, t: FloatArray) -> Stream:
+    """Only the rows on both sides of each time, where all of them hold everything: between them lies the same."""
+    after = np.searchsorted(truth.t, t, side="right")
+    rows = np.unique(np.clip(np.concatenate([after - 1, after]), 0, len(truth) - 1))
+    few = {name: a.take(rows) for name, a in truth.columns.items() if name == "t" or name.startswith(_READ)}
+    return Stream(few) if len(rows) > 1 and all(np.isfinite(a).all() for a in few.values()) else truth
+
+
+def _rows(solution: Solution, rows: NDArray[np.intp], stem: str, axes: str) -> FloatArray:
+    """Some rows of a vector."""
+    return np.column_stack([solution[f"{stem}_{a}"][rows] for a in axes])
+
+
+def _squared_distance(e: FloatArray, P: FloatArray) -> FloatArray:
+    """eᵀ P⁻¹ e of errors (n, k) and covariances (n, k, k), by elimination over all rows at once."""
+    k = e.shape[1]
+    A = np.ascontiguousarray(np.moveaxis(P, 0, -1))
+    x = np.array(e.T)
+    total = np.zeros(e.shape[0])
+    for i in range(k):
+        total += x[i] * x[i] / A[i, i]
+        for j in range(i + 1, k):
+            f = A[j, i] / A[i, i]
+            x[j] -= f * x[i]
+            A[j, i + 1 :] -= f * A[i, i + 1 :]
+    return np.asarray(total)
+
+
 def nees_series(solution: Solution, truth: Stream) -> dict[str, tuple[FloatArray, FloatArray]]:
     """Normalised estimation error squared of each block divided by its dof, ``(t, nees)``, at the covariance's times.
 
@@ -122,28 +154,29 @@ def nees_series(solution: Solution, truth: Stream) -> dict[str, tuple[FloatArray
     cov = solution.covariance
     if not cov or len(cov["t"]) == 0 or len(truth) < 2:
         return out
-    inside = (cov["t"] >= truth.t[0]) & (cov["t"] <= truth.t[-1]) & np.isin(cov["t"], solution.t)
-    t = cov["t"][inside]
+    row = np.minimum(np.searchsorted(solution.t, cov["t"]), len(solution) - 1)
+    inside = (cov["t"] >= truth.t[0]) & (cov["t"] <= truth.t[-1]) & (cov["t"] == solution.t[row])
+    t, row = cov["t"][inside], row[inside]
     if len(t) == 0:
         return out
-    row = np.searchsorted(solution.t, t)
+    truth = _around(truth, t)
     errors: dict[str, FloatArray] = {}
     q_ref = truth.vector("q", "wxyz")
     good = np.isfinite(q_ref).all(axis=1)
     if np.count_nonzero(good) > 1:
-        q = solution.vector("q", "wxyz")[row]
+        q = _rows(solution, row, "q", "wxyz")
         errors["attitude"] = rotation_vector(multiply(conjugate(q), slerp(t, truth.t[good], q_ref[good])))
     for block, stem, axes in (("velocity", "vel", "ned"), ("gyro_bias", "gyro_bias", "xyz"), ("accel_bias", "accel_bias", "xyz")):
         reference = truth.vector(stem, axes)
         good = np.isfinite(reference).all(axis=1)
         if f"{stem}_{axes[0]}" in solution and np.count_nonzero(good) > 1:
-            estimate = solution.vector(stem, axes)[row]
+            estimate = _rows(solution, row, stem, axes)
             errors[block] = np.column_stack([np.interp(t, truth.t[good], reference[good, k]) for k in range(3)]) - estimate
     if "pos_n" in solution:
         tp, p = reference_position(truth, solution.summary.get("origin"))
         known = np.isfinite(p)
         if all(np.count_nonzero(known[:, k]) > 1 for k in range(3)):
-            estimate = solution.vector("pos", "ned")[row]
+            estimate = _rows(solution, row, "pos", "ned")
             errors["position"] = np.column_stack([np.interp(t, tp[known[:, k]], p[known[:, k], k]) for k in range(3)]) - estimate
     if "baro_bias" in solution and "baro_bias" in truth and np.isfinite(truth["baro_bias"]).sum() > 1:
         good = np.isfinite(truth["baro_bias"])
@@ -151,7 +184,7 @@ def nees_series(solution: Solution, truth: Stream) -> dict[str, tuple[FloatArray
     for block in BLOCKS:
         if block in errors and block in cov:
             e = errors[block]
-            out[block] = (t, np.einsum("ni,ni->n", e, np.linalg.solve(cov[block][inside], e[..., None])[..., 0]) / e.shape[1])
+            out[block] = (t, _squared_distance(e, cov[block][inside]) / e.shape[1])
     return out
 
 

@@ -11,9 +11,21 @@ from numpy.typing import NDArray
 from haltere.flight.local import local_from_geodetic
 from haltere.flight.log import Stream
 from haltere.flight.solution import Solution
-from haltere.metrics.attitude import conjugate, euler, heading_between, multiply, rotation_vector, slerp, tilt_between
+from haltere.metrics.attitude import angles_between, conjugate, euler_between, multiply, rotation_vector, slerp
 
-__all__ = ["ANGLES", "attitude_error", "between", "error_series", "error_table", "lengths", "reference_position", "settling_time", "since"]
+__all__ = [
+    "ANGLES",
+    "attitude_error",
+    "between",
+    "error_series",
+    "error_table",
+    "largest",
+    "lengths",
+    "reference_position",
+    "rms",
+    "settling_time",
+    "since",
+]
 
 FloatArray = NDArray[np.float64]
 Series = dict[str, tuple[FloatArray, FloatArray]]
@@ -28,15 +40,30 @@ def between(rows: FloatArray, t: FloatArray, gap: float = 0.5) -> NDArray[np.boo
     """Times ``t`` (m,) that lie between two of the increasing ``rows`` (n,) not further apart than ``gap`` [s]."""
     if len(rows) < 2:
         return np.zeros(len(t), bool)
-    i = np.clip(np.searchsorted(rows, t, side="right") - 1, 0, len(rows) - 2)
     inside = (t >= rows[0]) & (t <= rows[-1])
-    inside &= rows[i + 1] - rows[i] <= gap
+    if np.diff(rows).max() > gap:
+        i = np.clip(np.searchsorted(rows, t, side="right") - 1, 0, len(rows) - 2)
+        inside &= rows[i + 1] - rows[i] <= gap
     return np.asarray(inside)
 
 
 def _inside(solution: Solution, t: FloatArray) -> NDArray[np.bool_]:
     """Reference times that the solution reaches."""
     return between(solution.t, t)
+
+
+def _piece(mask: NDArray[np.bool_]) -> NDArray[np.bool_] | slice:
+    """The mask, or where its rows lie together the slice of them, with which nothing is copied."""
+    n = int(np.count_nonzero(mask))
+    first = int(np.argmax(mask)) if n else 0
+    return slice(first, first + n) if mask[first : first + n].all() else mask
+
+
+def _at(solution: Solution, t: FloatArray) -> slice | None:
+    """Rows of the solution at just these times, where there is no need to interpolate."""
+    first = int(np.searchsorted(solution.t, t[0])) if len(t) else 0
+    rows = slice(first, first + len(t))
+    return rows if np.array_equal(solution.t[rows], t) else None
 
 
 def attitude_error(solution: Solution, reference: Stream) -> tuple[FloatArray, FloatArray, FloatArray]:
@@ -54,22 +81,20 @@ def attitude_error(solution: Solution, reference: Stream) -> tuple[FloatArray, F
     t, q, q_ref = _attitudes(solution, reference, _inside(solution, reference.t))
     if len(t) == 0:
         return t, np.empty((0, 3)), np.empty((0, 3))
-    return t, rotation_vector(multiply(conjugate(q), q_ref)), _wrapped(euler(q) - euler(q_ref))
+    return t, rotation_vector(multiply(conjugate(q), q_ref)), euler_between(q, q_ref)
 
 
 def _attitudes(solution: Solution, reference: Stream, inside: NDArray[np.bool_]) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Times, and unit quaternions of solution and reference at them, where both have one."""
-    q_ref = reference.vector("q", "wxyz")
-    good = np.isfinite(q_ref).all(axis=1) & inside
-    t, q_ref = reference.t[good], q_ref[good]
+    q_ref = np.array([reference.get(f"q_{a}") for a in "wxyz"])  # columns in one piece
+    norm = np.sqrt(np.einsum("ij,ij->j", q_ref, q_ref))
+    good = _piece(np.isfinite(norm) & inside)
+    t, q_ref = reference.t[good], (q_ref[:, good] / norm[good]).T
     if len(t) == 0:
         return t, np.empty((0, 4)), np.empty((0, 4))
-    q_ref = q_ref / np.sqrt(np.einsum("ij,ij->i", q_ref, q_ref))[:, None]
-    return t, slerp(t, solution.t, solution.vector("q", "wxyz")), q_ref
-
-
-def _wrapped(angle: FloatArray) -> FloatArray:
-    return np.asarray((angle + math.pi) % (2.0 * math.pi) - math.pi)
+    rows = _at(solution, t)
+    q = slerp(t, solution.t, solution.vector("q", "wxyz")) if rows is None else np.array([solution[f"q_{a}"][rows] for a in "wxyz"]).T
+    return t, q, q_ref
 
 
 def reference_position(reference: Stream, origin: list[float] | None) -> tuple[FloatArray, FloatArray]:
@@ -79,13 +104,13 @@ def reference_position(reference: Stream, origin: list[float] | None) -> tuple[F
     relative to the flight's home.
     """
     p = reference.vector("pos", "ned")
-    if origin is not None:
+    if origin is not None and any(name in reference for name in ("lat", "alt")):
         n, e, d = local_from_geodetic(reference.get("lat"), reference.get("lon"), reference.get("alt"), *origin)
         geodetic = np.column_stack([n, e, d])
         for axes in ([0, 1], [2]):  # a column comes from one source alone: two would differ by a step
             if np.isfinite(geodetic[:, axes]).any():
                 p[:, axes] = geodetic[:, axes]
-    good = np.isfinite(p).any(axis=1)
+    good = _piece(np.isfinite(p).any(axis=1))
     return reference.t[good], p[good]
 
 
@@ -98,11 +123,11 @@ def error_series(solution: Solution, reference: Stream) -> Series:
     inside = _inside(solution, reference.t)
     t, q, q_ref = _attitudes(solution, reference, inside)
     if len(t):
-        angles = _wrapped(euler(q) - euler(q_ref))
+        angles = euler_between(q, q_ref)
         for k, name in enumerate(("roll", "pitch", "yaw")):
             out[name] = (t, angles[:, k])
-        out["attitude"] = (t, np.linalg.norm(rotation_vector(multiply(conjugate(q), q_ref)), axis=1))
-        out["tilt"], out["heading"] = (t, tilt_between(q, q_ref)), (t, heading_between(q, q_ref))
+        for name, angle in zip(("attitude", "tilt", "heading"), angles_between(q, q_ref), strict=True):
+            out[name] = (t, angle)
     for stem, axes in VECTORS.items():
         times, values, within = reference.t, reference, inside
         if stem == "pos":
@@ -110,13 +135,19 @@ def error_series(solution: Solution, reference: Stream) -> Series:
                 continue
             times, p = reference_position(reference, solution.summary.get("origin"))
             values = Stream({"t": times} | {f"pos_{a}": p[:, k] for k, a in enumerate(axes)})
-            within = _inside(solution, times)
+            within = inside if len(times) == len(reference) else _inside(solution, times)
+        where = _piece(within)
+        t = times[where]
+        rows = _at(solution, t)
         for name in (f"{stem}_{a}" for a in axes):
             if name not in solution or name not in values:
                 continue
-            good = np.isfinite(values[name]) & within
-            if good.any():
-                out[name] = (times[good], np.interp(times[good], solution.t, solution[name]) - values[name][good])
+            value = values[name][where]
+            good = np.isfinite(value)
+            if good.all() and len(t):
+                out[name] = (t, (np.interp(t, solution.t, solution[name]) if rows is None else solution[name][rows]) - value)
+            elif good.any():
+                out[name] = (t[good], np.interp(t[good], solution.t, solution[name]) - value[good])
     return out
 
 
@@ -131,15 +162,19 @@ def lengths(series: Series) -> Series:
         if any(name not in series for name in names):
             continue
         t = series[names[0]][0]
-        if all(np.array_equal(series[name][0], t) for name in names[1:]):
+        if all(series[name][0] is t or np.array_equal(series[name][0], t) for name in names[1:]):
             out[stem] = (t, np.sqrt(sum(series[name][1] ** 2 for name in names)))
     return out
 
 
 def since(series: Series, begin: float, end: float = math.inf) -> Series:
     """The same errors at times from ``begin`` to ``end`` [s]; names with none are left out."""
-    kept = {name: (t >= begin) & (t <= end) for name, (t, _) in series.items()}
-    return {name: (t[kept[name]], e[kept[name]]) for name, (t, e) in series.items() if kept[name].any()}
+    kept: dict[int, tuple[NDArray[np.bool_] | slice, FloatArray]] = {}  # by the array of times, which most share
+    for t, _ in series.values():
+        if id(t) not in kept:
+            where = _piece((t >= begin) & (t <= end)) if len(t) else slice(0, 0)
+            kept[id(t)] = where, t[where]
+    return {name: (kept[id(t)][1], e[kept[id(t)][0]]) for name, (t, e) in series.items() if len(kept[id(t)][1])}
 
 
 def settling_time(t: FloatArray, error: FloatArray, bound: float, begin: float | None = None) -> float:
@@ -170,13 +205,22 @@ def settling_time(t: FloatArray, error: FloatArray, bound: float, begin: float |
     return float(t[rows[-1] + 1] - begin) if len(rows) else 0.0
 
 
+def rms(error: FloatArray) -> float:
+    """Root of the mean square. Not by a product of BLAS, whose threads cost more than they save on so few."""
+    return math.sqrt(float(np.einsum("i,i->", error, error)) / len(error))
+
+
+def largest(error: FloatArray) -> float:
+    """Largest magnitude."""
+    return float(max(error.max(), -error.min()))
+
+
 def error_table(series: Series) -> dict[str, dict[str, float]]:
     """RMS and largest absolute error by name; angles in degrees under ``*_deg``."""
     out: dict[str, dict[str, float]] = {}
     for name, (_, error) in series.items():
         angle = name in ANGLES
         k = 180.0 / math.pi if angle else 1.0
-        e = k * error
-        row: dict[str, Any] = {"rms": float(np.sqrt(np.mean(e * e))), "max": float(np.max(np.abs(e))), "n": len(e)}
+        row: dict[str, Any] = {"rms": k * rms(error), "max": k * largest(error), "n": len(error)}
         out[f"{name}_deg" if angle else name] = row
     return out
