@@ -6,6 +6,7 @@ import math
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 
 from haltere.core.rotation import quat_from_rotvec
 from haltere.drive import run
@@ -13,16 +14,21 @@ from haltere.estimators.base import InitialState
 from haltere.flight.log import FlightLog
 from haltere.metrics.attitude import multiply
 from haltere.metrics.consistency import DOF, band, nees_series
-from haltere.simulate import demo_flight
+from haltere.simulate import Scenario, demo_flight
+from haltere.simulate.simulator import simulate
 
 #: 1 sigma of the initial errors: attitude [rad], velocity [m/s], position [m], gyro bias [rad/s], accelerometer bias [m/s^2], offset [m].
 SD = np.r_[np.radians([5.0, 5.0, 10.0]), np.full(3, 0.5), np.full(3, 1.0), np.full(3, 0.01), np.full(3, 0.2), 2.0]
 
 
-def _start(flight: FlightLog, rng: np.random.Generator) -> InitialState:
+#: The same of a simulated rotorcraft, whose IMU's turn-on biases are smaller.
+SD_ROTORCRAFT = np.r_[SD[:9], np.full(3, 0.005), np.full(3, 0.1), SD[15]]
+
+
+def _start(flight: FlightLog, rng: np.random.Generator, sd: NDArray[np.float64] = SD) -> InitialState:
     """Truth at the first sample, less an error drawn from P0. The biases' errors are the simulated biases themselves."""
     truth = flight["truth"]
-    e = SD * rng.standard_normal(len(SD))
+    e = sd * rng.standard_normal(len(sd))
     return InitialState(
         t=float(flight["imu"].t[0]),
         q_nb=multiply(truth.vector("q", "wxyz")[0], np.array(quat_from_rotvec((-e[0], -e[1], -e[2])))),
@@ -30,7 +36,7 @@ def _start(flight: FlightLog, rng: np.random.Generator) -> InitialState:
         pos_n=truth.vector("pos", "ned")[0] - e[6:9],
         gyro_bias_b=np.zeros(3),
         accel_bias_b=np.zeros(3),
-        P=np.diag(SD**2),
+        P=np.diag(sd**2),
         baro_bias=0.0,
     )
 
@@ -46,6 +52,56 @@ def _mean_nees(flights: int, first_seed: int) -> tuple[dict[str, float], dict[st
         for sensor, row in solution.summary["nis"].items():
             nis.setdefault(sensor, []).append(row["mean"])
     return {b: float(np.mean(v)) for b, v in nees.items()}, {s: float(np.mean(v)) for s, v in nis.items()}
+
+
+def _rotorcraft(seed: int) -> FlightLog:
+    """A minute of a rotorcraft in gusty wind, in the air from the start; its sensors have the noise that the filter is told."""
+    mission = ("figure-eight", "box", "lissajous", "climb", "tour")[seed % 5]
+    wind = {"n": 4.0, "e": 2.0, "gust": 1.0}
+    scenario = Scenario(mission=mission, duration=60.0, seed=seed, rest=0.0, landing=False, tell_noise=True, wind=wind)
+    return simulate(scenario)
+
+
+def _rotorcraft_scores(flights: int, first_seed: int) -> tuple[dict[tuple[str, str], float], dict[str, list[float]]]:
+    """Mean NEES of each block of filter and smoother, and the mean squares of their errors."""
+    nees: dict[tuple[str, str], list[float]] = {}
+    squares: dict[str, list[float]] = {}
+    for k in range(first_seed, first_seed + flights):
+        flight = _rotorcraft(k)
+        solution = run(flight, initial=_start(flight, np.random.default_rng([7, k]), SD_ROTORCRAFT), smooth=True)
+        assert solution.smoothed is not None
+        for which, rows in (("filter", solution), ("smoother", solution.smoothed)):
+            for block, (_, value) in nees_series(rows, flight["truth"]).items():
+                nees.setdefault((which, block), []).append(float(value.mean()))
+        for which, table in enumerate((solution.summary["errors"]["truth"], solution.summary["smoothed"]["errors"]["truth"])):
+            for name, row in table.items():
+                squares.setdefault(name, [0.0, 0.0])[which] += row["rms"] ** 2 / flights
+    return {b: float(np.mean(v)) for b, v in nees.items()}, squares
+
+
+@pytest.mark.parametrize(("flights", "first"), [(30, 500), pytest.param(200, 2000, marks=pytest.mark.slow)])
+def test_nees_of_simulated_rotorcraft_is_inside_the_band(flights: int, first: int) -> None:
+    """Every block of filter and smoother inside the 99.9 % χ² band of so many flights, and the smoother's errors smaller."""
+    nees, squares = _rotorcraft_scores(flights, first)
+    assert set(nees) == {(which, block) for which in ("filter", "smoother") for block in DOF}
+    for (which, block), value in nees.items():
+        low, high = band(DOF[block], float(flights), 0.999)
+        assert low < value < high, (which, block, value, low, high)
+    for name, (filtered, smoothed) in squares.items():
+        assert smoothed < filtered, name
+
+
+def test_the_band_catches_sensors_worse_than_the_filter_is_told() -> None:
+    values: dict[str, list[float]] = {}
+    for k in range(10):
+        flight = _rotorcraft(900 + k)
+        start = _start(flight, np.random.default_rng([8, k]), SD_ROTORCRAFT)
+        solution = run(flight, set={"noise.gyro": 5e-4, "noise.barometer": 0.2}, initial=start, smooth=True)
+        assert solution.smoothed is not None
+        for block, (_, value) in nees_series(solution.smoothed, flight["truth"]).items():
+            values.setdefault(block, []).append(float(value.mean()))
+    assert np.mean(values["attitude"]) > band(3.0, 10.0, 0.999)[1]
+    assert np.mean(values["position"]) > band(3.0, 10.0, 0.999)[1]
 
 
 def test_nees_of_50_flights_is_inside_the_band() -> None:

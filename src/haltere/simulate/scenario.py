@@ -69,7 +69,8 @@ class Scenario:
     temperature
         Air at home [degC]: with the height it gives the density.
     tell_noise
-        The flight names the noise of its magnetometer and barometer as configuration. Only for tests of consistency.
+        The flight names the noise of its magnetometer and barometer as configuration, and that errors are not there which a
+        filter otherwise allows for. Only for tests of consistency.
     """
 
     name: str = "simulated"

@@ -70,18 +70,27 @@ def simulate(scenario: Scenario | str | Path) -> FlightLog:
     faults = [parse_fault(word) for word in scenario.fault]
     truth = simulate_truth(scenario.changed(vehicle=vehicle), p["rate"], faults).moved(np.array([p["arm_x"], p["arm_y"], p["arm_z"]]))
     streams, biases = sense(truth, parameters, scenario.seed)
-    noise = {s: parameters[s]["noise"] for s in ("magnetometer", "barometer")} if scenario.tell_noise else {}
     meta = FlightMeta(
         name=scenario.name,
         source=f"haltere simulate, {vehicle.name}, {scenario.mission}, seed {scenario.seed}",
         start_utc=scenario.start_utc,
         home=scenario.home,
         delays={s: q["delay"] for s, q in parameters.items() if q["delay"] > 0.0 and s in streams},
-        noise=noise,
+        noise=_told(parameters) if scenario.tell_noise else {},
         faults=[f.as_table() for f in faults if f.simulated_only],
     )
     flight = FlightLog({**streams, "truth": truth.columns() | biases}, meta, [f"simulated: {meta.source}"])
     return inject(flight, [f for f in faults if not f.simulated_only])
+
+
+def _told(parameters: dict[str, dict[str, float]]) -> dict[str, float]:
+    """Noise of the sensors as a filter's configuration knows it, errors that they do not have included; for tests of consistency."""
+    imu, compass = parameters["imu"], parameters["magnetometer"]
+    out = {s: parameters[s]["noise"] for s in ("magnetometer", "barometer")}
+    out["gyro_scale"] = math.hypot(imu["gyro_scale"], imu["gyro_misalignment"])
+    if not any(compass[k] for k in ("walk", "hard_iron", "soft_iron", "current", "throttle")):
+        out["field"] = 0.0
+    return out
 
 
 def simulate_truth(scenario: Scenario, imu_rate: float = 250.0, faults: list[Fault] | None = None) -> Truth:
