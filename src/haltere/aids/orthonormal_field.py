@@ -14,12 +14,13 @@ from haltere._jit import constant, jit
 from haltere.aids.fusing import ANY_TURN, NO_GATE, NOTHING, RUNNING, THREE, Offer
 from haltere.aids.magnetometer import learn_field, reset_yaw, yaw_variance
 from haltere.aids.record import C_FIELD, E_RESET, FUSED, MAGNETOMETER, R_HORIZONTAL, R_NONE, R_START, R_STRENGTH, event, record
-from haltere.core.rotation import Mat, Vec, cross, dcm, dot, mat_vec, norm, scale, sub, tmat_vec, wrap
+from haltere.core.rotation import Vec, cross, dcm, dot, mat_vec, norm, scale, sub, tmat_vec, wrap
+from haltere.filter.gates import joint_nis
 from haltere.filter.robust import DROPPED, PLAIN, inflate
-from haltere.filter.update import NONE
+from haltere.filter.update import NONE, Row
 from haltere.strapdown.layout import THETA
 
-__all__ = ["index", "offer", "orthonormal", "variances"]
+__all__ = ["decorrelated", "index", "offer", "orthonormal", "variances"]
 
 #: Words of ``two_stage.index``.
 RELATIVE, ALGEBRAIC = (constant(i) for i in (0, 1))
@@ -28,6 +29,8 @@ RELATIVE, ALGEBRAIC = (constant(i) for i in (0, 1))
 SPHERE = 1.0 / math.sqrt(3.0)
 #: From a bound on sqrt(NIS/3) to one on sqrt(NIS).
 ROOT3 = math.sqrt(3.0)
+#: The measurement along (ê, ĝ, m_⊥).
+UNIT_NORTH = (0.0, 0.0, 1.0)
 
 
 @jit
@@ -48,7 +51,7 @@ def orthonormal(g: Vec, m: Vec) -> tuple[Vec, Vec, float]:
 
 
 @jit
-def variances(a: Any, g: Vec, m: Vec, sd: float, radial: float) -> tuple[float, float, float, float]:
+def variances(a: Any, g: Vec, m: Vec, sd: float, radial: float, repeats: float) -> tuple[float, float, float, float]:
     """R_⊥ of m_⊥ in the axes (ê, ĝ, m_⊥): east, down, their covariance, north (theory.md §4.5, reconstructed).
 
     R_⊥ = J_m σ² J_mᵀ + J_g P_g J_gᵀ + σ_r² m_⊥ m_⊥ᵀ with P_g = [ĝ]× P_θ [ĝ]×ᵀ of EKF A. In these axes, with the error δθ of A,
@@ -62,6 +65,8 @@ def variances(a: Any, g: Vec, m: Vec, sd: float, radial: float) -> tuple[float, 
         Unit gravity and field [uT], body frame.
     sd
         Noise of the field [uT].
+    repeats
+        Factor on P_g: over how many samples an error of A lasts.
     radial
         Slack σ_r [1]; NaN: as much as the noise makes across.
     """
@@ -70,12 +75,36 @@ def variances(a: Any, g: Vec, m: Vec, sd: float, radial: float) -> tuple[float, 
     nn, ne, ee = 0.0, 0.0, 0.0
     for i in range(3):
         for j in range(3):
-            p = a.P[i, j]
+            p = repeats * a.P[i, j]
             nn += north[i] * p * north[j]
             ne += north[i] * p * east[j]
             ee += east[i] * p * east[j]
     noise = (sd / max(horizontal, 1e-9)) ** 2
     return noise + tan_dip * tan_dip * nn, ee, -tan_dip * ne, radial * radial if radial == radial else noise
+
+
+@jit
+def decorrelated(east: Vec, g: Vec, north: Vec, h: Vec, R: tuple[float, float, float, float]) -> tuple[Vec, tuple[Row, Row, Row], Vec]:
+    """Predictions, rows of H and variances along (ê, ĝ - k ê, m_⊥), which R_⊥ does not correlate: k is the covariance over R_ee.
+
+    Parameters
+    ----------
+    east, g, north
+        Axes in the body frame, from EKF A and the field.
+    h
+        Prediction C_Bᵀ [cos D, sin D, 0] (41)-(42); its derivative against δθ of EKF B is [h]×.
+    R
+        From `variances`.
+    """
+    r_e, r_d, r_ed, r_n = R
+    k = r_ed / r_e
+    down = sub(g, scale(east, k))
+    H = (
+        ((THETA, cross(east, h)), NONE, NONE),
+        ((THETA, cross(down, h)), NONE, NONE),
+        ((THETA, cross(north, h)), NONE, NONE),
+    )
+    return (dot(east, h), dot(down, h), dot(north, h)), H, (r_e, r_d - k * r_ed, r_n)
 
 
 @jit
@@ -114,6 +143,9 @@ def offer(s: Any, prm: Any, m: Any, aids: Any) -> Offer:
 
     The three components are those along EKF A's east, down and north, decorrelated in this order, so that fusing them one after the
     other is the joint update. In λ go the strength (44) and, where ``two_stage.innovation`` is on, sqrt(NIS/3), as one factor each.
+
+    A shares IMU and GNSS with B, and its error lasts: the source takes every sample for a new measurement of gravity. [E]: with
+    ``two_stage.memory`` τ, P_g counts as often as samples fall into 2τ, the length of a first-order process' memory.
     """
     z = (m.z[0], m.z[1], m.z[2])
     a = s.aid[MAGNETOMETER]
@@ -138,18 +170,19 @@ def offer(s: Any, prm: Any, m: Any, aids: Any) -> Offer:
         if yaw_variance(s, C) > 0.25:  # above 30 deg linearisation means little: set, do not fuse
             begin_yaw(s, prm, m, aids, wrap(s.field[0] - math.atan2(mu[1], mu[0])))
             return NOTHING
-    r_e, r_d, r_ed, r_n = variances(stage, g, z, prm.noise_magnetometer, prm.two_stage_radial)
     h = tmat_vec(C, (math.cos(s.field[0]), math.sin(s.field[0]), 0.0))
-    k = r_ed / r_e
-    down: Vec = sub(g, scale(east, k))
-    rows: Mat = (cross(east, h), cross(down, h), cross(north, h))
-    H = (((THETA, rows[0]), NONE, NONE), ((THETA, rows[1]), NONE, NONE), ((THETA, rows[2]), NONE, NONE))
-    gate = NO_GATE
-    soft = NO_GATE
-    innovation_form = PLAIN
+    predicted, H, r = decorrelated(east, g, north, h, variances(stage, g, z, prm.noise_magnetometer, prm.two_stage_radial, 1.0))
+    gate, soft, how = NO_GATE, NO_GATE, PLAIN
     if prm.two_stage_innovation > 0.0:
-        gate, soft, innovation_form = ROOT3 * prm.gate_magnetometer, prm.two_stage_soft, form
+        gate, soft, how = ROOT3 * prm.gate_magnetometer, prm.two_stage_soft, form
+    if prm.two_stage_memory > 0.0:  # the test is of the sample alone, the fusion of what is new in it
+        repeats = max(1.0, 2.0 * prm.two_stage_memory / max(m.t - a.t_passed, 1e-3))
+        once, _ = joint_nis(s, H[0], H[1], H[2], sub(UNIT_NORTH, predicted), r)
+        R = variances(stage, g, z, prm.noise_magnetometer, prm.two_stage_radial, repeats)
+        predicted, H, r = decorrelated(east, g, north, h, R)
+        often, _ = joint_nis(s, H[0], H[1], H[2], sub(UNIT_NORTH, predicted), r)
+        c = math.sqrt(often / max(once, 1e-30))
+        gate, soft = c * gate, c * soft
     return (
-        THREE, C_FIELD, (0.0, 0.0, 1.0), (dot(east, h), dot(down, h), dot(north, h)), (r_e, r_d - k * r_ed, r_n), H, gate,
-        prm.timeout_magnetometer, reason, ANY_TURN, (innovation_form, soft, 1.0 / factor),
+        THREE, C_FIELD, UNIT_NORTH, predicted, r, H, gate, prm.timeout_magnetometer, reason, ANY_TURN, (how, soft, 1.0 / factor),
     )  # fmt: skip

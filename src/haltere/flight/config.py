@@ -187,6 +187,10 @@ KEYS: dict[str, Key] = {
     "two_stage.radial": _positive(
         math.nan, "1", "Slack of the unit horizontal field along itself, which its noise does not move. Default: as much as across."
     ),
+    "two_stage.memory": Key(
+        0.0, "s", "How long an error of the first stage's gravity lasts; its variance counts 2 memory/interval times. 0: each sample anew.",
+        low=0.0, high=1e4,
+    ),
     "two_stage.earth": _switch("ellipsoid", "North and east of a fix on WGS-84, or by the printed haversine.", ("ellipsoid", "sphere")),
     "two_stage.height_sign": Key(
         -1.0, "-1 or 1", "Down position of a fix on the sphere is this times (h - h0); the source prints 1.", low=-1.0, high=1.0
@@ -230,14 +234,14 @@ _OVERRIDES: dict[str, dict[str, Value]] = {
     "ahrs": {"aid.gnss": "off", "aid.barometer": "off", "aid.fake_velocity": "on", "baro.offset": "off"},
     "two-stage": {
         "aid.magnetometer": "orthonormal", "aid.barometer": "off", "baro.offset": "off", "aid.fake_velocity": "off",
-        "aid.zero_velocity": "off", "aid.zero_rate": "off", "aid.yaw_bank": "off", "gate.magnetometer": 6.0, "two_stage.radial": 0.05,
+        "aid.zero_velocity": "off", "aid.zero_rate": "off", "aid.yaw_bank": "off", "gate.magnetometer": 6.0, "two_stage.radial": 0.05, "two_stage.memory": 5.0,
     },
 }  # fmt: skip
 _NO_GATE = 1e6
 #: What a preset of an estimator sets differently from its `default`. The source has no innovation tests.
 _PRESET_OVERRIDES: dict[tuple[str, str], dict[str, Value]] = {
     ("two-stage", "as-corrected"): {
-        "two_stage.tolerance": 0.03, "two_stage.innovation": "off", "two_stage.radial": math.nan, "two_stage.earth": "sphere",
+        "two_stage.tolerance": 0.03, "two_stage.innovation": "off", "two_stage.radial": math.nan, "two_stage.memory": 0.0, "two_stage.earth": "sphere",
         "gate.gnss": _NO_GATE,
     },
 }  # fmt: skip
