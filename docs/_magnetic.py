@@ -108,7 +108,9 @@ def disturbed(flight: FlightLog, disturbance: Callable[[Array, int, Array], tupl
         added = rotate_to_body(q, added)
     columns = {**mag.columns, **{f"mag_{a}": mag[f"mag_{a}"] + added[:, k] for k, a in enumerate("xyz")}}
     name = (disturbance.__doc__ or "").rstrip(".")
-    return FlightLog({**flight.streams, "magnetometer": Stream(columns)}, flight.meta, [*flight.notes, f"added to the magnetometer: {name}"])
+    return FlightLog(
+        {**flight.streams, "magnetometer": Stream(columns)}, flight.meta, [*flight.notes, f"added to the magnetometer: {name}"]
+    )
 
 
 def _field_n() -> Array:
@@ -150,7 +152,8 @@ def measure(seeds: range, told: Callable[[str], None] = lambda text: None) -> di
     for (i, j), values in sorted(kept.items()):
         v = np.array(values)
         rows.append({
-            "case": CASES[i][0], "filter": FILTERS[j][0], "tilt_rms": float(np.sqrt(v[:, 0].mean())), "yaw_rms": float(np.sqrt(v[:, 1].mean())),
+            "case": CASES[i][0], "filter": FILTERS[j][0],
+            "tilt_rms": float(np.sqrt(v[:, 0].mean())), "yaw_rms": float(np.sqrt(v[:, 1].mean())),
             "tilt_max": float(np.median(v[:, 2])), "yaw_max": float(np.median(v[:, 3])), "tilt_worst": float(v[:, 2].max()),
             "yaw_worst": float(v[:, 3].max()),
         })  # fmt: skip

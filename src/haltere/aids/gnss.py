@@ -70,10 +70,10 @@ def position_observation(s: Any, prm: Any, z: Any) -> Vec:
         s.origin[0], s.origin[1], s.origin[2] = z[0], z[1], z[2]
         s.has_origin = 1
         s.gravity = gravity(z[0], z[2])
-    if prm.two_stage_earth > 0.0:
+    north, east, down = local_from_geodetic(z[0], z[1], z[2], s.origin[0], s.origin[1], s.origin[2])
+    if prm.two_stage_haversine > 0.0:
         north, east = local_from_sphere(z[0], z[1], s.origin[0], s.origin[1])
-        return (north, east, prm.two_stage_height_sign * (z[2] - s.origin[2]))
-    return local_from_geodetic(z[0], z[1], z[2], s.origin[0], s.origin[1], s.origin[2])
+    return (north, east, down if prm.two_stage_height_sign == 0.0 else -down)
 
 
 @jit

@@ -115,8 +115,10 @@ KEYS: dict[str, Key] = {
     "aid.gnss": _switch("on", "Use GNSS position and velocity."),
     "aid.barometer": _switch("on", "Use the barometer."),
     "aid.magnetometer": _switch(
-        "heading", "Use the magnetometer: as a heading that leaves tilt alone, as three axes, or (two-stage, which has no other) as the horizontal "
-        "field orthonormal to the gravity of its first stage.", ("off", "heading", "3-axis", "orthonormal")
+        "heading",
+        "Use the magnetometer: as a heading that leaves tilt alone, as three axes, or (two-stage, which has no other) as the horizontal "
+        "field orthonormal to the gravity of its first stage.",
+        ("off", "heading", "3-axis", "orthonormal"),
     ),
     "aid.zero_velocity": _switch("on", "Zero velocity at rest."),
     "aid.zero_rate": _switch("on", "Zero rate at rest."),
@@ -170,16 +172,21 @@ KEYS: dict[str, Key] = {
     "rest.accel": _positive(0.3, "m/s^2", "At rest the standard deviation of |f| over a second is below this."),
     "rest.gravity": _positive(0.5, "m/s^2", "At rest mean |f| differs from gravity by less than this."),
     "two_stage.tolerance": _positive(
-        math.nan, "1", "T_D: what one unit of the anomaly index is, in |F| (uT^2 where the index is algebraic). Default: the index's own 1 "
+        math.nan,
+        "1",
+        "T_D: what one unit of the anomaly index is, in |F| (uT^2 where the index is algebraic). Default: the index's own 1 "
         "sigma, 2 noise.magnetometer/field.strength. Higher lets more disturbed field in.",
     ),
     "two_stage.k1": _positive(2.0, "T_D", "Anomaly index from which the magnetometer's variance is inflated."),
     "two_stage.k2": _positive(6.0, "T_D", "Anomaly index from which a magnetometer sample is dropped."),
     "two_stage.robust": _switch(
-        "igg3", "How the variance grows between k1 and k2; huber never drops, off takes every sample as it is.", ("off", "igg3", "huber", "step")
+        "igg3",
+        "How the variance grows between k1 and k2; huber never drops, off takes every sample as it is.",
+        ("off", "igg3", "huber", "step"),
     ),
     "two_stage.index": _switch(
-        "relative", "F of the anomaly index: |m|^2/|H|^2 - 1, or the algebraic |m|^2 - |H|^2 [uT^2] of the printed one.",
+        "relative",
+        "F of the anomaly index: |m|^2/|H|^2 - 1, or the algebraic |m|^2 - |H|^2 [uT^2] of the printed one.",
         ("relative", "algebraic"),
     ),
     "two_stage.innovation": _switch("on", "A second factor from sqrt(NIS/3): two_stage.robust from two_stage.soft to gate.magnetometer."),
@@ -188,12 +195,15 @@ KEYS: dict[str, Key] = {
         math.nan, "1", "Slack of the unit horizontal field along itself, which its noise does not move. Default: as much as across."
     ),
     "two_stage.memory": Key(
-        0.0, "s", "How long an error of the first stage's gravity lasts; its variance counts 2 memory/interval times. 0: each sample anew.",
-        low=0.0, high=1e4,
+        0.0,
+        "s",
+        "How long an error of the first stage's gravity lasts; its variance counts 2 memory/interval times. 0: each sample anew.",
+        low=0.0,
+        high=1e4,
     ),
-    "two_stage.earth": _switch("ellipsoid", "North and east of a fix on WGS-84, or by the printed haversine.", ("ellipsoid", "sphere")),
-    "two_stage.height_sign": Key(
-        -1.0, "-1 or 1", "Down position of a fix on the sphere is this times (h - h0); the source prints 1.", low=-1.0, high=1.0
+    "two_stage.haversine": _switch("off", "North and east of a fix by the haversine on a sphere, as printed, instead of on WGS-84."),
+    "two_stage.height_sign": _switch(
+        "minus", "Down position of a fix is minus the height above the origin; plus is a misprint of the source.", ("minus", "plus")
     ),
     "imu.kind": _switch("instant", "An IMU sample is the value at its time, or the mean since the sample before.", ("instant", "mean")),
     "baro.temperature": Key(
@@ -234,20 +244,22 @@ _OVERRIDES: dict[str, dict[str, Value]] = {
     "ahrs": {"aid.gnss": "off", "aid.barometer": "off", "aid.fake_velocity": "on", "baro.offset": "off"},
     "two-stage": {
         "aid.magnetometer": "orthonormal", "aid.barometer": "off", "baro.offset": "off", "aid.fake_velocity": "off",
-        "aid.zero_velocity": "off", "aid.zero_rate": "off", "aid.yaw_bank": "off", "gate.magnetometer": 6.0, "two_stage.radial": 0.05, "two_stage.memory": 5.0,
+        "aid.zero_velocity": "off", "aid.zero_rate": "off", "aid.yaw_bank": "off", "gate.magnetometer": 6.0, "two_stage.radial": 0.05,
+        "two_stage.memory": 10.0,
     },
 }  # fmt: skip
 _NO_GATE = 1e6
 #: What a preset of an estimator sets differently from its `default`. The source has no innovation tests.
 _PRESET_OVERRIDES: dict[tuple[str, str], dict[str, Value]] = {
     ("two-stage", "as-corrected"): {
-        "two_stage.tolerance": 0.03, "two_stage.innovation": "off", "two_stage.radial": math.nan, "two_stage.memory": 0.0, "two_stage.earth": "sphere",
+        "two_stage.tolerance": 0.03, "two_stage.innovation": "off", "two_stage.radial": math.nan,
+        "two_stage.memory": 0.0, "two_stage.haversine": "on",
         "gate.gnss": _NO_GATE,
     },
 }  # fmt: skip
 _PRESET_OVERRIDES["two-stage", "as-printed"] = _PRESET_OVERRIDES["two-stage", "as-corrected"] | {
     "two_stage.index": "algebraic",
-    "two_stage.height_sign": 1.0,
+    "two_stage.height_sign": "plus",
 }
 #: Keys that an estimator does not have: changing them would change nothing, or make it another one.
 _FIXED: dict[str, tuple[str, ...]] = {
@@ -302,10 +314,13 @@ def defaults(estimator: str = "navigator", preset: str = "default") -> dict[str,
         hint = f"did you mean {near[0]!r}?" if near else f"one of {', '.join(ESTIMATORS)}"
         raise UsageError("an estimator", repr(estimator), "--estimator", hint)
     if preset not in PRESETS[estimator]:
+        alone = f"{estimator} is not one of the published designs, so it has no printed or corrected form"
         raise UsageError(
-            f"a preset of {estimator} ({', '.join(PRESETS[estimator])})", repr(preset), "--preset",
-            f"{estimator} is not one of the published designs, so it has no printed or corrected form" if len(PRESETS[estimator]) == 1 else "",
-        )  # fmt: skip
+            f"a preset of {estimator} ({', '.join(PRESETS[estimator])})",
+            repr(preset),
+            "--preset",
+            alone if len(PRESETS[estimator]) == 1 else "",
+        )
     return {key: spec.default for key, spec in KEYS.items()} | _OVERRIDES[estimator] | _PRESET_OVERRIDES.get((estimator, preset), {})
 
 
@@ -357,6 +372,9 @@ def resolve(estimator: str = "navigator", preset: str = "default", overrides: Ma
                 left = [w for w in KEYS[name].words if w not in _LACKS[estimator][name]]
                 raise UsageError(f"{name} of {estimator} to be {' or '.join(left)}", repr(checked), where)
             values[name] = checked
+    if estimator == "two-stage" and not float(values["two_stage.k1"]) < float(values["two_stage.k2"]):
+        found = f"{values['two_stage.k1']} and {values['two_stage.k2']}"
+        raise UsageError("two_stage.k1 below two_stage.k2", found, where, "the variance is inflated between them")
     return Config(estimator, preset, values)
 
 
