@@ -15,7 +15,6 @@ from haltere.aids.fusing import ANY_TURN, NO_GATE, NOTHING, RUNNING, THREE, Offe
 from haltere.aids.magnetometer import learn_field, reset_yaw, yaw_variance
 from haltere.aids.record import C_FIELD, E_RESET, FUSED, MAGNETOMETER, R_HORIZONTAL, R_NONE, R_START, R_STRENGTH, event, record
 from haltere.core.rotation import Vec, cross, dcm, dot, mat_vec, norm, scale, sub, tmat_vec, wrap
-from haltere.filter.gates import joint_nis
 from haltere.filter.robust import DROPPED, PLAIN, inflate
 from haltere.filter.update import NONE, Row
 from haltere.strapdown.layout import THETA
@@ -27,7 +26,7 @@ RELATIVE, ALGEBRAIC = (constant(i) for i in (0, 1))
 #: a of (25) for a sphere of radius |H| about the origin is (1, 1, 1, 0, ..., -|H|²) times this, where its fit was held to aᵀ B a = 1 (26)
 #: with B of Li and Griffiths: 4 J - I² = 3 c².
 SPHERE = 1.0 / math.sqrt(3.0)
-#: From a bound on sqrt(NIS/3) to one on sqrt(NIS).
+#: From sqrt(NIS/3) to sqrt(NIS): of the three components only the heading is much the magnetometer's.
 ROOT3 = math.sqrt(3.0)
 #: The measurement along (ê, ĝ, m_⊥).
 UNIT_NORTH = (0.0, 0.0, 1.0)
@@ -51,7 +50,7 @@ def orthonormal(g: Vec, m: Vec) -> tuple[Vec, Vec, float]:
 
 
 @jit
-def variances(a: Any, g: Vec, m: Vec, sd: float, radial: float, repeats: float) -> tuple[float, float, float, float]:
+def variances(a: Any, g: Vec, m: Vec, noise: float, radial: float, repeats: float) -> tuple[float, float, float, float]:
     """R_⊥ of m_⊥ in the axes (ê, ĝ, m_⊥): east, down, their covariance, north (theory.md §4.5, reconstructed).
 
     R_⊥ = J_m σ² J_mᵀ + J_g P_g J_gᵀ + σ_r² m_⊥ m_⊥ᵀ with P_g = [ĝ]× P_θ [ĝ]×ᵀ of EKF A. In these axes, with the error δθ of A,
@@ -63,8 +62,8 @@ def variances(a: Any, g: Vec, m: Vec, sd: float, radial: float, repeats: float) 
         Record of EKF A, whose P_θ is read.
     g, m
         Unit gravity and field [uT], body frame.
-    sd
-        Noise of the field [uT].
+    noise
+        Variance of the field [uT^2].
     repeats
         Factor on P_g: over how many samples an error of A lasts.
     radial
@@ -79,7 +78,7 @@ def variances(a: Any, g: Vec, m: Vec, sd: float, radial: float, repeats: float) 
             nn += north[i] * p * north[j]
             ne += north[i] * p * east[j]
             ee += east[i] * p * east[j]
-    noise = (sd / max(horizontal, 1e-9)) ** 2
+    noise /= max(horizontal * horizontal, 1e-18)
     return noise + tan_dip * tan_dip * nn, ee, -tan_dip * ne, radial * radial if radial == radial else noise
 
 
@@ -113,7 +112,7 @@ def index(prm: Any, m: Vec, strength: float) -> float:
 
     Relative, [C]: F = |m|²/|H|² - 1 of the calibrated field, without dimension. Algebraic, [S]: F of (25) as it stands, d(m)ᵀ a, which
     for a calibrated field is c (|m|² - |H|²) and has the unit of the field squared [uT²]: in gauss it would be 10⁴ times smaller.
-    The tolerance T_D, where it is not given, is the index's own standard deviation 2 σ_m/|H|.
+    The tolerance T_D, where it is not given, is the index's own standard deviation 2 σ_m/|H|, with all that is told of the field's noise.
     """
     excess = dot(m, m) - strength * strength
     F = excess / (strength * strength)
@@ -121,7 +120,7 @@ def index(prm: Any, m: Vec, strength: float) -> float:
         F = SPHERE * excess
     tolerance = prm.two_stage_tolerance
     if tolerance != tolerance:
-        tolerance = 2.0 * prm.noise_magnetometer / strength
+        tolerance = 2.0 * math.sqrt(prm.noise_magnetometer**2 + prm.noise_field**2) / strength
     return abs(F) / tolerance
 
 
@@ -142,10 +141,12 @@ def offer(s: Any, prm: Any, m: Any, aids: Any) -> Offer:
     """Magnetometer sample ``m.z`` [uT, body] to EKF B: z = m_⊥, h = C_Bᵀ [cos D, sin D, 0] (41)-(42), R̄ = λ R_⊥ (45).
 
     The three components are those along EKF A's east, down and north, decorrelated in this order, so that fusing them one after the
-    other is the joint update. In λ go the strength (44) and, where ``two_stage.innovation`` is on, sqrt(NIS/3), as one factor each.
+    other is the joint update. In λ go the strength (44) and, where ``two_stage.innovation`` is on, sqrt(NIS), as one factor each.
 
     A shares IMU and GNSS with B, and its error lasts: the source takes every sample for a new measurement of gravity. [E]: with
-    ``two_stage.memory`` τ, P_g counts as often as samples fall into 2τ, the length of a first-order process' memory.
+    ``two_stage.memory`` τ, P_g counts as often as samples fall into 2τ, the length of a first-order process' memory, as does
+    ``noise.field`` within its own time. The test is of a sample alone, but for the component along gravity, which is not the
+    magnetometer's.
     """
     z = (m.z[0], m.z[1], m.z[2])
     a = s.aid[MAGNETOMETER]
@@ -170,19 +171,19 @@ def offer(s: Any, prm: Any, m: Any, aids: Any) -> Offer:
         if yaw_variance(s, C) > 0.25:  # above 30 deg linearisation means little: set, do not fuse
             begin_yaw(s, prm, m, aids, wrap(s.field[0] - math.atan2(mu[1], mu[0])))
             return NOTHING
+    white, slow = prm.noise_magnetometer * prm.noise_magnetometer, prm.noise_field * prm.noise_field
+    since = max(m.t - s.compass.t_before, 1e-3)
+    s.compass.t_before = m.t
+    once = variances(stage, g, z, white + slow, prm.two_stage_radial, 1.0)
+    alike = max(1.0, 2.0 * prm.noise_field_time / since)
+    lasting = variances(stage, g, z, white + alike * slow, prm.two_stage_radial, max(1.0, 2.0 * prm.two_stage_memory / since))
+    shared = lasting[0] / once[0]
     h = tmat_vec(C, (math.cos(s.field[0]), math.sin(s.field[0]), 0.0))
-    predicted, H, r = decorrelated(east, g, north, h, variances(stage, g, z, prm.noise_magnetometer, prm.two_stage_radial, 1.0))
+    predicted, H, r = decorrelated(east, g, north, h, lasting)
+    r = (once[0], r[1] / shared, once[3])
     gate, soft, how = NO_GATE, NO_GATE, PLAIN
     if prm.two_stage_innovation > 0.0:
-        gate, soft, how = ROOT3 * prm.gate_magnetometer, prm.two_stage_soft, form
-    if prm.two_stage_memory > 0.0:  # the test is of the sample alone, the fusion of what is new in it
-        repeats = max(1.0, 2.0 * prm.two_stage_memory / max(m.t - a.t_passed, 1e-3))
-        once, _ = joint_nis(s, H[0], H[1], H[2], sub(UNIT_NORTH, predicted), r)
-        R = variances(stage, g, z, prm.noise_magnetometer, prm.two_stage_radial, repeats)
-        predicted, H, r = decorrelated(east, g, north, h, R)
-        often, _ = joint_nis(s, H[0], H[1], H[2], sub(UNIT_NORTH, predicted), r)
-        c = math.sqrt(often / max(once, 1e-30))
-        gate, soft = c * gate, c * soft
+        gate, soft, how = prm.gate_magnetometer, prm.robust_innovation / ROOT3, form
     return (
-        THREE, C_FIELD, UNIT_NORTH, predicted, r, H, gate, prm.timeout_magnetometer, reason, ANY_TURN, (how, soft, 1.0 / factor),
+        THREE, C_FIELD, UNIT_NORTH, predicted, r, H, gate, prm.timeout_magnetometer, reason, ANY_TURN, (how, soft, 1.0 / factor, shared),
     )  # fmt: skip

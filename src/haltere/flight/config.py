@@ -174,8 +174,8 @@ KEYS: dict[str, Key] = {
     "two_stage.tolerance": _positive(
         math.nan,
         "1",
-        "T_D: what one unit of the anomaly index is, in |F| (uT^2 where the index is algebraic). Default: the index's own 1 "
-        "sigma, 2 noise.magnetometer/field.strength. Higher lets more disturbed field in.",
+        "T_D: one unit of the anomaly index, in |F| (uT^2 where the index is algebraic). Default: the index's own 1 sigma, twice that of "
+        "the field over its strength. Higher lets more disturbed field in.",
     ),
     "two_stage.k1": _positive(2.0, "T_D", "Anomaly index from which the magnetometer's variance is inflated."),
     "two_stage.k2": _positive(6.0, "T_D", "Anomaly index from which a magnetometer sample is dropped."),
@@ -189,8 +189,9 @@ KEYS: dict[str, Key] = {
         "F of the anomaly index: |m|^2/|H|^2 - 1, or the algebraic |m|^2 - |H|^2 [uT^2] of the printed one.",
         ("relative", "algebraic"),
     ),
-    "two_stage.innovation": _switch("on", "A second factor from sqrt(NIS/3): two_stage.robust from two_stage.soft to gate.magnetometer."),
-    "two_stage.soft": _positive(2.5, "sigma", "sqrt(NIS/3) of the magnetometer from which its variance is inflated."),
+    "two_stage.innovation": _switch(
+        "on", "A second factor from sqrt(NIS): two_stage.robust from robust.innovation to gate.magnetometer, where it is dropped."
+    ),
     "two_stage.radial": _positive(
         math.nan, "1", "Slack of the unit horizontal field along itself, which its noise does not move. Default: as much as across."
     ),
@@ -244,8 +245,8 @@ _OVERRIDES: dict[str, dict[str, Value]] = {
     "ahrs": {"aid.gnss": "off", "aid.barometer": "off", "aid.fake_velocity": "on", "baro.offset": "off"},
     "two-stage": {
         "aid.magnetometer": "orthonormal", "aid.barometer": "off", "baro.offset": "off", "aid.fake_velocity": "off",
-        "aid.zero_velocity": "off", "aid.zero_rate": "off", "aid.yaw_bank": "off", "gate.magnetometer": 6.0, "two_stage.radial": 0.05,
-        "two_stage.memory": 10.0,
+        "aid.zero_velocity": "off", "aid.zero_rate": "off", "aid.yaw_bank": "off", "aid.compass_watch": "off",
+        "aid.motor_field": "off", "two_stage.radial": 0.05, "two_stage.memory": 10.0,
     },
 }  # fmt: skip
 _NO_GATE = 1e6
@@ -254,7 +255,7 @@ _PRESET_OVERRIDES: dict[tuple[str, str], dict[str, Value]] = {
     ("two-stage", "as-corrected"): {
         "two_stage.tolerance": 0.03, "two_stage.innovation": "off", "two_stage.radial": math.nan,
         "two_stage.memory": 0.0, "two_stage.haversine": "on",
-        "gate.gnss": _NO_GATE,
+        "gate.gnss": _NO_GATE, "noise.field": 0.0, "noise.gyro_scale": 0.0,
     },
 }  # fmt: skip
 _PRESET_OVERRIDES["two-stage", "as-printed"] = _PRESET_OVERRIDES["two-stage", "as-corrected"] | {
@@ -265,7 +266,20 @@ _PRESET_OVERRIDES["two-stage", "as-printed"] = _PRESET_OVERRIDES["two-stage", "a
 _FIXED: dict[str, tuple[str, ...]] = {
     "navigator": _TWO_STAGE,
     "ahrs": (*_OVERRIDES["ahrs"], *_TWO_STAGE),
-    "two-stage": ("aid.barometer", "baro.offset", "aid.fake_velocity", "aid.zero_velocity", "aid.zero_rate", "aid.yaw_bank"),
+    "two-stage": (
+        "aid.barometer",
+        "baro.offset",
+        "aid.fake_velocity",
+        "aid.zero_velocity",
+        "aid.zero_rate",
+        "aid.yaw_bank",
+        "aid.compass_watch",
+        "aid.motor_field",
+        "robust.strength",
+        "robust.dip",
+        "robust.heading",
+        "robust.calibration",
+    ),
 }
 #: Words of a switch that an estimator does not have.
 _LACKS: dict[str, dict[str, tuple[str, ...]]] = {

@@ -239,7 +239,7 @@ PARAMETERS = np.dtype(
             "init_tilt_rest init_tilt_motion init_yaw_compass init_yaw_unknown init_gyro_bias_rest init_gyro_bias "
             "init_accel_bias init_velocity init_baro_bias init_mag_offset "
             "rest_gyro rest_accel rest_gravity "
-            "two_stage_tolerance two_stage_k1 two_stage_k2 two_stage_robust two_stage_index two_stage_innovation two_stage_soft "
+            "two_stage_tolerance two_stage_k1 two_stage_k2 two_stage_robust two_stage_index two_stage_innovation "
             "two_stage_radial two_stage_memory "
             "two_stage_haversine two_stage_height_sign "
             "imu_mean horizon covariance_interval"
