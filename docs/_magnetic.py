@@ -1,7 +1,8 @@
 """The experiment of the two-stage filter rebuilt in simulation: disturbed magnetometers, and what filters make of them.
 
-``python docs/_magnetic.py --seeds 100 --out docs/_data/two_stage.json`` makes the table of the page on it; the page itself shows the
-table and runs one flight. Conditions are those of theory.md §4.8: dip 60 degrees, magnetometer noise 1.5 % of the field, 50 s,
+``python docs/_magnetic.py --seeds 100 --out docs/_data/two_stage.json`` makes the table of the page on it, and
+``python docs/_magnetic.py --real .../ansfl_qdr/StraightLine/RAW --out docs/_data/two_stage_qdr.json`` that of a real flight; the page
+shows them and runs one flight. Conditions are those of theory.md §4.8: dip 60 degrees, magnetometer noise 1.5 % of the field, 50 s,
 errors from 15 s on.
 """
 
@@ -36,6 +37,7 @@ START, END = 20.0, 30.0
 #: A plain filter with three axes: no test of the magnetometer, and nothing else that the source lacks.
 PLAIN = {
     "aid.magnetometer": "3-axis", "gate.magnetometer": 1e6, "field.tolerance_strength": 1e3, "field.tolerance_dip": 7.0,
+    "aid.compass_watch": "off", "aid.motor_field": "off", "robust.innovation": 1e6, "noise.field": 0.0,
     "aid.barometer": "off", "baro.offset": "off", "aid.zero_velocity": "off", "aid.zero_rate": "off", "aid.yaw_bank": "off",
 }  # fmt: skip
 #: Columns: title, estimator, preset, keys.
@@ -43,7 +45,12 @@ FILTERS: list[tuple[str, str, str, dict[str, Any]]] = [
     ("three-axis EKF, no test", "navigator", "default", PLAIN),
     ("two-stage, no test", "two-stage", "as-corrected", {"two_stage.robust": "off"}),
     ("two-stage + IGG(F) (`as-corrected`)", "two-stage", "as-corrected", {}),
-    ("two-stage + IGG(F) + innovation", "two-stage", "as-corrected", {"two_stage.innovation": "on", "two_stage.radial": 0.05}),
+    (
+        "two-stage + IGG(F) + innovation",
+        "two-stage",
+        "as-corrected",
+        {"two_stage.innovation": "on", "two_stage.radial": 0.05, "gate.magnetometer": 6.0},
+    ),
     ("two-stage `default`", "two-stage", "default", {}),
     ("heading only, all tests (`navigator`)", "navigator", "default", {}),
 ]
@@ -161,7 +168,7 @@ def measure(seeds: range, told: Callable[[str], None] = lambda text: None) -> di
 
 
 def table(results: Mapping[str, Any]) -> str:
-    """The figures as a Markdown table: tilt RMS / yaw RMS / tilt max / yaw max [deg], the larger of the last two below them."""
+    """The figures as a Markdown table: tilt RMS / yaw RMS / tilt max / yaw max [deg]."""
     names = [name for name, *_ in FILTERS]
     lines = ["| case | " + " | ".join(names) + " |", "|---|" + "---|" * len(names)]
     cells = {(r["case"], r["filter"]): r for r in results["rows"]}
@@ -174,13 +181,57 @@ def table(results: Mapping[str, Any]) -> str:
     return "\n".join(lines)
 
 
+def real(folder: Path) -> dict[str, Any]:
+    """The straight lines of ANSFL QDR (see the tests' converter): RMS against the vehicle's attitude and RTK after the first minute."""
+    sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests"))
+    from converters import QDR_CALIBRATION, ansfl_qdr
+    from haltere.metrics.errors import error_series
+
+    rows = []
+    for calibrated in (True, False):
+        for imu in (1, 4):
+            flight = ansfl_qdr(folder, imu, calibrated=calibrated)
+            begins = flight["imu"].t[0] + QDR_CALIBRATION
+            for estimator, preset in REAL:
+                series = error_series(haltere.run(flight, estimator, preset=preset), flight["onboard"])
+                rms = {name: float(np.sqrt(np.mean(e[t > begins] ** 2))) for name, (t, e) in series.items()}
+                rows.append({
+                    "magnetometer": "calibrated" if calibrated else "as it is", "imu": f"DOT {imu}",
+                    "estimator": estimator, "preset": preset,
+                    **{f"{a}_deg": float(np.degrees(rms[a])) for a in ("roll", "pitch", "yaw")},
+                    "vel_ne": float(np.hypot(rms["vel_n"], rms["vel_e"])), "vel_d": rms["vel_d"],
+                    "pos_ne": float(np.hypot(rms["pos_n"], rms["pos_e"])), "pos_d": rms["pos_d"],
+                })  # fmt: skip
+    return {"version": haltere.__version__, "rows": rows}
+
+
+#: What is run over the real flight.
+REAL = [("two-stage", "default"), ("two-stage", "as-corrected"), ("two-stage", "as-printed"), ("navigator", "default")]
+
+
+def real_table(results: Mapping[str, Any]) -> str:
+    """The figures of `real` as a Markdown table."""
+    heads = ["magnetometer", "IMU", "estimator", "roll [deg]", "pitch [deg]", "yaw [deg]"]
+    heads += ["velocity, horizontal [m/s]", "down [m/s]", "position, horizontal [m]", "down [m]"]
+    lines = ["| " + " | ".join(heads) + " |", "|---" * len(heads) + "|"]
+    for r in results["rows"]:
+        who = f"`{r['estimator']}`" + (f" `{r['preset']}`" if r["estimator"] != "navigator" else "")
+        figures = [f"{r[k]:.2f}" for k in ("roll_deg", "pitch_deg", "yaw_deg", "vel_ne", "vel_d", "pos_ne", "pos_d")]
+        lines.append(f"| {r['magnetometer']} | {r['imu']} | {who} | " + " | ".join(figures) + " |")
+    return "\n".join(lines)
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--seeds", type=int, default=100)
     parser.add_argument("--first", type=int, default=1)
+    parser.add_argument("--real", type=Path, help="folder StraightLine/RAW of ANSFL QDR: the table of the real flight instead")
     parser.add_argument("--out", type=Path)
     given = parser.parse_args()
-    results = measure(range(given.first, given.first + given.seeds), lambda text: print(text, file=sys.stderr))
+    if given.real is not None:
+        results = real(given.real)
+    else:
+        results = measure(range(given.first, given.first + given.seeds), lambda text: print(text, file=sys.stderr))
     results["date"] = datetime.date.today().isoformat()
     results["machine"] = f"Python {platform.python_version()}, {platform.machine()}"
     try:
@@ -189,7 +240,7 @@ def main() -> None:
         ).stdout.strip()
     except (OSError, subprocess.CalledProcessError):
         results["commit"] = ""
-    print(table(results))
+    print(table(results) if given.real is None else real_table(results))
     if given.out is not None:
         given.out.write_text(json.dumps(results, indent=1) + "\n", encoding="utf-8")
 

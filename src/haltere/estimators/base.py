@@ -172,7 +172,7 @@ class Estimator:
     Parameters
     ----------
     name
-        ``navigator`` or ``ahrs``.
+        ``navigator``, ``ahrs`` or ``two-stage``.
     config
         A complete `Config`, or a mapping of configuration keys to change. Home and field that are not given are taken from
         the first fix (origin) and from the first magnetometer samples (field); declination is then 0.

@@ -255,7 +255,7 @@ _PRESET_OVERRIDES: dict[tuple[str, str], dict[str, Value]] = {
     ("two-stage", "as-corrected"): {
         "two_stage.tolerance": 0.03, "two_stage.innovation": "off", "two_stage.radial": math.nan,
         "two_stage.memory": 0.0, "two_stage.haversine": "on",
-        "gate.gnss": _NO_GATE, "noise.field": 0.0, "noise.gyro_scale": 0.0,
+        "gate.gnss": _NO_GATE, "gate.magnetometer": _NO_GATE, "noise.field": 0.0, "noise.gyro_scale": 0.0,
     },
 }  # fmt: skip
 _PRESET_OVERRIDES["two-stage", "as-printed"] = _PRESET_OVERRIDES["two-stage", "as-corrected"] | {
