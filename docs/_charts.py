@@ -61,7 +61,7 @@ def lines(
     for value in sorted({low, 0.0, high}, key=abs)[: 3 if low < 0.0 else 2]:
         parts.append(_text(left - 6.0, float(down(value)) + 4.0, f"{value:.2g}", "end"))
     parts += [
-        _text(left, height - foot + 14.0, f"{x[0]:.0f}"), _text(width - 10.0, height - foot + 14.0, f"{x[-1]:.0f}", "end"),
+        _text(left + 4.0, height - foot + 16.0, f"{x[0]:.0f}"), _text(width - 10.0, height - foot + 16.0, f"{x[-1]:.0f}", "end"),
         _text((left + width) / 2.0, height - 6.0, x_label), _text(12.0, (height - foot + top) / 2.0, y_label, turn=True),
     ]  # fmt: skip
     return _svg(width, height, f"{y_label} over {x_label}", parts)

@@ -167,17 +167,15 @@ def measure(seeds: range, told: Callable[[str], None] = lambda text: None) -> di
     return {"flights": len(seeds), "first_seed": seeds.start, "version": haltere.__version__, "rows": rows}
 
 
-def table(results: Mapping[str, Any]) -> str:
-    """The figures as a Markdown table: tilt RMS / yaw RMS / tilt max / yaw max [deg]."""
+def table(results: Mapping[str, Any], angle: str) -> str:
+    """RMS over all flights and largest error of a flight (median over flights, and the largest of all) of ``tilt`` or ``yaw`` [deg]."""
     names = [name for name, *_ in FILTERS]
     lines = ["| case | " + " | ".join(names) + " |", "|---|" + "---|" * len(names)]
     cells = {(r["case"], r["filter"]): r for r in results["rows"]}
     for case, *_ in CASES:
-        row = []
-        for name in names:
-            r = cells.get((case, name))
-            row.append("-" if r is None else f"{r['tilt_rms']:.2f} / {r['yaw_rms']:.2f} / {r['tilt_max']:.1f} / {r['yaw_max']:.1f}")
-        lines.append(f"| {case} | " + " | ".join(row) + " |")
+        row = [cells[case, name] for name in names]
+        said = [f"**{r[f'{angle}_rms']:.2f}**, {r[f'{angle}_max']:.1f} ({r[f'{angle}_worst']:.0f})" for r in row]
+        lines.append(f"| {case} | " + " | ".join(said) + " |")
     return "\n".join(lines)
 
 
@@ -209,15 +207,18 @@ def real(folder: Path) -> dict[str, Any]:
 REAL = [("two-stage", "default"), ("two-stage", "as-corrected"), ("two-stage", "as-printed"), ("navigator", "default")]
 
 
-def real_table(results: Mapping[str, Any]) -> str:
-    """The figures of `real` as a Markdown table."""
-    heads = ["magnetometer", "IMU", "estimator", "roll [deg]", "pitch [deg]", "yaw [deg]"]
-    heads += ["velocity, horizontal [m/s]", "down [m/s]", "position, horizontal [m]", "down [m]"]
+def real_table(results: Mapping[str, Any], magnetometer: str) -> str:
+    """The figures of `real` with a magnetometer ``calibrated`` or ``as it is``, as a Markdown table."""
+    heads = ["IMU", "estimator", "roll [deg]", "pitch [deg]", "yaw [deg]", "velocity, horizontal / down [m/s]"]
+    heads += ["position, horizontal / down [m]"]
     lines = ["| " + " | ".join(heads) + " |", "|---" * len(heads) + "|"]
     for r in results["rows"]:
+        if r["magnetometer"] != magnetometer:
+            continue
         who = f"`{r['estimator']}`" + (f" `{r['preset']}`" if r["estimator"] != "navigator" else "")
-        figures = [f"{r[k]:.2f}" for k in ("roll_deg", "pitch_deg", "yaw_deg", "vel_ne", "vel_d", "pos_ne", "pos_d")]
-        lines.append(f"| {r['magnetometer']} | {r['imu']} | {who} | " + " | ".join(figures) + " |")
+        figures = [f"{r[k]:.2f}" for k in ("roll_deg", "pitch_deg", "yaw_deg")]
+        figures += [f"{r[f'{k}_ne']:.2f} / {r[f'{k}_d']:.2f}" for k in ("vel", "pos")]
+        lines.append(f"| {r['imu']} | {who} | " + " | ".join(figures) + " |")
     return "\n".join(lines)
 
 
@@ -240,7 +241,8 @@ def main() -> None:
         ).stdout.strip()
     except (OSError, subprocess.CalledProcessError):
         results["commit"] = ""
-    print(table(results) if given.real is None else real_table(results))
+    for part in ("tilt", "yaw") if given.real is None else ("calibrated", "as it is"):
+        print(f"{part}\n{(table if given.real is None else real_table)(results, part)}\n")
     if given.out is not None:
         given.out.write_text(json.dumps(results, indent=1) + "\n", encoding="utf-8")
 
