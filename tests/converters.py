@@ -1,12 +1,15 @@
-"""Small converters of foreign recordings for the tests: PX4-ECL replay, InertialNav text files, BROAD. Not part of the package."""
+"""Small converters of foreign recordings for the tests: PX4-ECL replay, InertialNav, BROAD, ANSFL QDR. Not part of the package."""
 
 from __future__ import annotations
 
+import csv
 from pathlib import Path
 
 import numpy as np
 
+from haltere.flight.field import Field, earth_field
 from haltere.flight.log import FlightLog, FlightMeta
+from haltere.metrics.attitude import conjugate, multiply, slerp
 
 DEG = np.pi / 180.0
 
@@ -117,3 +120,113 @@ def enu_flu_from_ned_frd(q: np.ndarray) -> np.ndarray:
     """Quaternion body FLU to ENU of q_nb (NED/FRD): inverse of the map in theory-amendments.md §8."""
     c = np.sqrt(0.5)
     return c * np.column_stack([q[:, 0] + q[:, 3], q[:, 1] + q[:, 2], q[:, 1] - q[:, 2], q[:, 0] - q[:, 3]])
+
+
+#: Clock of the ANSFL QDR raw files of 11:14:38: seconds of the vehicle's log at ``SampleTimeFine`` 677.583 s (the first sample of DOT 1);
+#: both sensors are on one clock. 180.495 s was noted beside the data; correlating rates (`rates_fit`) gives 0.03 s less for both sensors.
+QDR_CLOCK, QDR_FIRST = 180.495 - 0.03, 677.583
+#: Xsens DOT (x forward, y left, z up as mounted) to FRD.
+#: How long the magnetometer is calibrated [s].
+QDR_CALIBRATION = 60.0
+QDR_AXES = np.array([1.0, -1.0, -1.0])
+
+
+def ansfl_qdr(folder: Path, imu: int = 1, seed: int = 1, calibrated: bool = False) -> FlightLog:
+    """Raw straight lines of ANSFL QDR: an Xsens DOT (1 or 4) on a DJI Phantom 4 RTK; ``onboard`` is the vehicle's own attitude and RTK.
+
+    The vehicle has no plain GNSS in its log: ``gnss`` is its RTK position and velocity at 5 Hz with white noise of 1 m and 0.1 m/s added,
+    seeded, and says so. The magnetometer is that of DOT 1 for both, in its arbitrary unit times what makes its mean over the first ten
+    seconds the strength of the Earth's field. Calibrated: scale and hard iron by least squares against the Earth's field seen from
+    the vehicle's own attitude over the first `QDR_CALIBRATION`; errors are to be counted after it.
+    """
+    air, dot, mag = _qdr_vehicle(folder), _qdr_dot(folder, imu), _qdr_dot(folder, 1)
+    t0 = max(dot["t"][0], mag["t"][0])
+    dot, mag = ({k: v[x["t"] > t0] for k, v in x.items()} for x in (dot, mag))
+    here = (air["t"] >= t0) & (air["t"] <= dot["t"][-1])
+    air = {k: v[here] for k, v in air.items()}
+    rng = np.random.default_rng(seed)
+    field = earth_field(float(air["lat"][0]), float(air["lon"][0]), float(air["alt"][0]), 2022.51)
+    m = mag["mag"] * field.strength / np.linalg.norm(mag["mag"][:1200], axis=1).mean()
+    if calibrated:
+        m = _qdr_calibrated(mag, air, field)
+    s = slice(0, None, 2)
+    metres = 1.0 / np.array([110_900.0, 111_320.0 * np.cos(air["lat"][0] * DEG)])
+    n = len(air["t"][s])
+    place = np.column_stack([air["lat"][s], air["lon"][s]]) + rng.normal(0.0, 1.0, (n, 2)) * metres
+    streams = {
+        "imu": {"t": dot["t"], **_columns("gyro", dot["gyro"]), **_columns("accel", dot["accel"])},
+        "magnetometer": {"t": mag["t"], **_columns("mag", m)},
+        "gnss": {
+            "t": air["t"][s], "lat": place[:, 0], "lon": place[:, 1], "alt": air["alt"][s] + rng.normal(0.0, 1.0, n),
+            **_columns("vel", air["vel"][s] + rng.normal(0.0, 0.1, (n, 3)), "ned"), "h_acc": np.full(n, 1.0), "v_acc": np.full(n, 1.0),
+            "s_acc": np.full(n, 0.1),
+        },
+        "onboard": {"t": air["t"], **_columns("q", air["q"], "wxyz"), **_columns("vel", air["vel"], "ned"),
+                    "lat": air["lat"], "lon": air["lon"], "alt": air["alt"]},
+    }  # fmt: skip
+    said = "GNSS is RTK at 5 Hz with white noise of 1 m and 0.1 m/s added"
+    said += ", magnetometer calibrated with the vehicle's attitude" if calibrated else ""
+    meta = FlightMeta(name=f"straight lines, DOT {imu}", source=f"ANSFL QDR; {said}, seed {seed}", start_utc="2022-07-07T08:10:25Z")
+    return FlightLog(streams, meta, [said])
+
+
+def _qdr_calibrated(mag: dict[str, np.ndarray], air: dict[str, np.ndarray], field: Field) -> np.ndarray:
+    """Field [uT] of DOT 1: m = (Cᵀ h)/k + b solved for 1/k and b at the vehicle's attitudes."""
+    h = field.strength * np.array(
+        [np.cos(field.dip) * np.cos(field.declination), np.cos(field.dip) * np.sin(field.declination), np.sin(field.dip)]
+    )
+    use = mag["t"] < mag["t"][0] + QDR_CALIBRATION
+    q = slerp(mag["t"][use], air["t"], air["q"])
+    pure = np.column_stack([np.zeros(len(q)), np.tile(h, (len(q), 1))])
+    seen = multiply(multiply(conjugate(q), pure), q)[:, 1:]
+    A = np.column_stack([seen.ravel(), np.tile(np.eye(3), (len(q), 1))])
+    x, *_ = np.linalg.lstsq(A, mag["mag"][use].ravel(), rcond=None)
+    return np.asarray((mag["mag"] - x[1:]) / x[0])
+
+
+def _qdr_vehicle(folder: Path) -> dict[str, np.ndarray]:
+    """The vehicle's log at 10 Hz: degrees, metres, m/s NED, q_nb. Its speeds are towards north, east and down, as its positions say."""
+    with open(next(folder.glob("*Airdata.csv")), encoding="utf-8-sig") as file:
+        rows = list(csv.reader(file))
+    at = {name.strip(): k for k, name in enumerate(rows[0])}
+
+    def column(name: str) -> np.ndarray:
+        return np.array([float(row[at[name]]) for row in rows[1:] if len(row) > at["roll(degrees)"]])
+
+    rpy = np.column_stack([column(f"{n}(degrees)") for n in ("roll", "pitch", "compass_heading")]) * DEG
+    return {
+        "t": column("time(millisecond)") * 1e-3, "lat": column("latitude"), "lon": column("longitude"),
+        "alt": column("altitude_above_seaLevel(meters)"), "vel": np.column_stack([column(f"{a}Speed(m/s)") for a in "xyz"]),
+        "q": _quaternions(rpy),
+    }  # fmt: skip
+
+
+def _qdr_dot(folder: Path, imu: int) -> dict[str, np.ndarray]:
+    """One Xsens DOT on the vehicle's clock and axes: rad/s, m/s^2, the field in its arbitrary unit."""
+    a = np.genfromtxt(next(folder.glob(f"*DOT{imu}_*.csv")), delimiter=",", skip_header=2)  # the first row has no inertial data yet
+    out = {"t": a[:, 0] * 1e-6 - QDR_FIRST + QDR_CLOCK, "accel": a[:, 4:7] * QDR_AXES, "gyro": a[:, 7:10] * DEG * QDR_AXES}
+    return out | ({"mag": a[:, 10:13] * QDR_AXES} if a.shape[1] > 12 else {})
+
+
+def rates_fit(folder: Path, imu: int, offsets: np.ndarray) -> tuple[float, np.ndarray, float]:
+    """Offset [s] of a DOT's clock to add to its times, the rotation from its FRD axes to the vehicle's, and the share of the vehicle's
+    rates that they leave unexplained, from the offsets tried: means of the gyro over the vehicle's steps against its turns (Wahba).
+    """
+    from scipy.spatial.transform import Rotation
+
+    air, dot = _qdr_vehicle(folder), _qdr_dot(folder, imu)
+    q = Rotation.from_quat(air["q"][:, [1, 2, 3, 0]])
+    turn = (q[:-1].inv() * q[1:]).as_rotvec()
+    angle = np.cumsum(dot["gyro"], axis=0) * np.median(np.diff(dot["t"]))
+    best = (0.0, np.eye(3), np.inf)
+    for offset in offsets:
+        t = dot["t"] + offset
+        use = (air["t"][:-1] > t[0] + 1.0) & (air["t"][1:] < t[-1] - 1.0)
+        mean = np.column_stack([np.diff(np.interp(air["t"], t, angle[:, k])) for k in range(3)])[use]
+        a, b = turn[use] - turn[use].mean(axis=0), mean - mean.mean(axis=0)
+        u, _, v = np.linalg.svd(a.T @ b)
+        M = u @ np.diag([1.0, 1.0, np.linalg.det(u @ v)]) @ v
+        left = float(np.sum((a - b @ M.T) ** 2) / np.sum(a**2))
+        if left < best[2]:
+            best = (float(offset), M, left)
+    return best

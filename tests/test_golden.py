@@ -60,6 +60,7 @@ def _compare(name: str, text: str, update: bool) -> None:
         ("demo_navigator", lambda: demo_flight(1, 60.0), "navigator"),
         ("demo_no_compass", lambda: demo_flight(2, 60.0).without("magnetometer"), "navigator"),
         ("demo_ahrs", lambda: demo_flight(1, 60.0), "ahrs"),
+        ("demo_two_stage", lambda: demo_flight(1, 60.0), "two-stage"),
     ],
 )
 def test_demo(name: str, make: Callable[[], haltere.FlightLog], estimator: str, request: pytest.FixtureRequest) -> None:

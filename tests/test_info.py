@@ -40,7 +40,7 @@ def _by_name(flight: FlightLog) -> dict[str, tuple[str, str, str]]:
 
 
 def test_a_complete_log_is_supported() -> None:
-    assert {s.estimator: s.verdict for s in support(_flight())} == {"navigator": "yes", "ahrs": "yes"}
+    assert {s.estimator: s.verdict for s in support(_flight())} == {"navigator": "yes", "ahrs": "yes", "two-stage": "yes"}
 
 
 @pytest.mark.parametrize(

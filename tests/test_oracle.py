@@ -11,7 +11,7 @@ import pytest
 
 from haltere._jit import COMPILED
 
-#: Runs both estimators over five seconds that hold alignment at rest, take-off and every sensor, and once online; writes all it got.
+#: Runs all estimators over five seconds that hold alignment at rest, take-off and every sensor, and once online; writes all it got.
 SCRIPT = """
 import sys
 import numpy as np
@@ -29,8 +29,9 @@ for name, options in (
     ("ahrs", {}),
     ("late", {"delay.gnss": 0.12, "delay.barometer": 0.05, "arm.gnss_x": 0.2, "aid.magnetometer": "3-axis"}),
     ("mean", {"imu.kind": "mean", "aid.magnetometer": "off", "init.yaw_unknown": 1.5}),
+    ("two-stage", {"noise.field": 1.0, "two_stage.robust": "huber", "two_stage.haversine": "on"}),
 ):
-    solution = run(flight, "ahrs" if name == "ahrs" else "navigator", set=options)
+    solution = run(flight, name if name in ("ahrs", "two-stage") else "navigator", set=options)
     out |= {f"{name}.{k}": v for k, v in solution.table.items()} | {f"{name}.aid.{k}": v for k, v in solution.aids.items()}
     out |= {f"{name}.P.{k}": v for k, v in solution.covariance.items()}
     out[f"{name}.events"] = np.array([f"{e['kind']} {e['sensor']} {e['t_onset']:.6f}" for e in solution.events])
@@ -97,5 +98,6 @@ def test_the_twins_saw_every_sensor(twins: tuple[dict[str, np.ndarray], dict[str
     assert set(plain["ahrs.aid.sensor"]) >= {"magnetometer", "fake_velocity", "fake_position"}
     assert "mag_x" in plain["late.aid.component"]
     assert not (plain["mean.aid.sensor"] == "magnetometer").any()
+    assert {"field_east", "vel_n", "pos_n"} <= set(plain["two-stage.aid.component"])
     assert len(plain["online.records"]) > 50
     assert any(e.startswith("aligned") for e in plain["navigator.events"])

@@ -60,7 +60,7 @@ def run(
     flight
         The log. Streams ``onboard`` and ``truth`` are compared with afterwards and never read by the estimator.
     estimator
-        ``navigator`` or ``ahrs``.
+        ``navigator``, ``ahrs`` or ``two-stage``.
 
     Other Parameters
     ----------------

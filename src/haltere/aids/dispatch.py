@@ -5,7 +5,19 @@ from __future__ import annotations
 from typing import Any
 
 from haltere._jit import jit
-from haltere.aids import barometer, compass, fake, gnss, interference, magnetometer, rest, zero_rate, zero_velocity
+from haltere.aids import (
+    barometer,
+    compass,
+    fake,
+    first_stage,
+    gnss,
+    interference,
+    magnetometer,
+    orthonormal_field,
+    rest,
+    zero_rate,
+    zero_velocity,
+)
 from haltere.aids.fusing import NOTHING, Offer, fuse_offer
 from haltere.aids.record import (
     BAROMETER,
@@ -37,6 +49,8 @@ def offer_of(s: Any, prm: Any, sensor: int, m: Any, aids: Any, dt: float, w: Vec
     if sensor == BAROMETER:
         return barometer.offer(s, prm, m, aids)
     if sensor == MAGNETOMETER:
+        if len(s.a) > 0:
+            return orthonormal_field.offer(s, prm, m, aids)
         return magnetometer.offer(s, prm, m, aids)
     if sensor == POWER:
         interference.hear(s, m.t, m.z[0])
@@ -94,9 +108,13 @@ def fuse_all(s: Any, prm: Any, aids: Any, dt: float, w: Vec, f: Vec, first: int,
             d = dcm((s.q[0], s.q[1], s.q[2], s.q[3]))[2]
             offer = offer_of(s, prm, sensor, m, aids, dt, w, resting)
             yaw, bias = s.yaw_corrected, d[0] * s.bg[0] + d[1] * s.bg[1] + d[2] * s.bg[2]
+            fused = s.aid[sensor].n_fused
             fuse_offer(s, aids, t, sensor, offer)
             if sensor == MAGNETOMETER:
                 compass.attribute(s, yaw, bias)
+            if sensor == GNSS_VELOCITY and s.aid[sensor].n_fused > fused:
+                for k in range(len(s.a)):
+                    first_stage.fuse_velocity(s.a[k], prm, m)
         if i < 0 or sensor >= N_QUEUED:  # a queue is emptied before the next sensor
             sensor += 1
     wake = s.aid[N_QUEUED].t_due

@@ -146,7 +146,7 @@ def fuse_offer(s: Any, aids: Any, t: float, sensor: int, offer: Offer) -> None:
     status, reason, weight = judge(s, sensor, t, ratio, timeout, reason)
     if status == FUSED:
         present = (1.0 if ok0 else 0.0) + (1.0 if ok1 else 0.0) + (1.0 if ok2 else 0.0)
-        weight = weighed / inflate(form, math.sqrt(nis / max(present, 1.0)), soft, gate)
+        weight = weighed / inflate(form, math.sqrt(nis / max(present, 1.0)), soft, gate / math.sqrt(max(present, 1.0)))
         if weight < 1.0:
             status = DEWEIGHTED
             r = (r[0] / weight, r[1] / weight, r[2] / weight)

@@ -8,12 +8,20 @@ from typing import Any
 from haltere._jit import jit
 from haltere.aids.fusing import ANY_TURN, HARD, NOTHING, RUNNING, THREE, Offer
 from haltere.aids.record import BAROMETER, C_POS, C_VEL, E_RESET, FUSED, GNSS_POSITION, R_NONE, R_START, event, record
-from haltere.core.earth import gravity, local_from_geodetic
+from haltere.core.earth import gravity, local_from_geodetic, local_from_sphere
 from haltere.core.rotation import Mat, Vec, cross, dcm, dot, mat_vec
-from haltere.filter.update import NONE
+from haltere.filter.update import NONE, Row
 from haltere.strapdown.layout import BG, POS, THETA, VEL
 
-__all__ = ["lever_rows", "offer_position", "offer_velocity", "position_observation", "position_variance", "velocity_variance"]
+__all__ = [
+    "lever_rows",
+    "offer_position",
+    "offer_velocity",
+    "position_observation",
+    "position_variance",
+    "velocity_model",
+    "velocity_variance",
+]
 
 #: Variance above which an accuracy says no more [m^2, m^2/s^2]: infinity would poison a gain.
 WORTHLESS = 1e8
@@ -56,18 +64,21 @@ def position_variance(prm: Any, r: Any) -> Vec:
 
 
 @jit
-def position_observation(s: Any, z: Any) -> Vec:
+def position_observation(s: Any, prm: Any, z: Any) -> Vec:
     """North, east, down [m] of a fix (lat, lon, alt); the first three-dimensional one sets the origin where none is set."""
     if s.has_origin == 0 and z[0] == z[0] and z[2] == z[2]:
         s.origin[0], s.origin[1], s.origin[2] = z[0], z[1], z[2]
         s.has_origin = 1
         s.gravity = gravity(z[0], z[2])
-    return local_from_geodetic(z[0], z[1], z[2], s.origin[0], s.origin[1], s.origin[2])
+    north, east, down = local_from_geodetic(z[0], z[1], z[2], s.origin[0], s.origin[1], s.origin[2])
+    if prm.two_stage_haversine > 0.0:
+        north, east = local_from_sphere(z[0], z[1], s.origin[0], s.origin[1])
+    return (north, east, down if prm.two_stage_height_sign == 0.0 else -down)
 
 
 @jit
-def offer_velocity(s: Any, prm: Any, m: Any) -> Offer:
-    """GNSS velocity: h = v + C (ω × r) with the antenna at r (theory-amendments.md §8)."""
+def velocity_model(s: Any, prm: Any) -> tuple[Vec, tuple[Row, Row, Row], Vec]:
+    """GNSS velocity: h = v + C (ω × r) with the antenna at r (theory-amendments.md §8), its rows, and C (ω × r)."""
     arm = (prm.arm_gnss_x, prm.arm_gnss_y, prm.arm_gnss_z)
     C = dcm((s.q[0], s.q[1], s.q[2], s.q[3]))
     swing = cross((s.w[0], s.w[1], s.w[2]), arm)
@@ -79,7 +90,13 @@ def offer_velocity(s: Any, prm: Any, m: Any) -> Offer:
         ((THETA, T[1]), (VEL, ONES[1]), (BG, B[1])),
         ((THETA, T[2]), (VEL, ONES[2]), (BG, B[2])),
     )
-    h = (s.v[0] + offset[0], s.v[1] + offset[1], s.v[2] + offset[2])
+    return (s.v[0] + offset[0], s.v[1] + offset[1], s.v[2] + offset[2]), H, offset
+
+
+@jit
+def offer_velocity(s: Any, prm: Any, m: Any) -> Offer:
+    """GNSS velocity with its own variances where given, see `velocity_model`; what the bank of yaw hypotheses reads is left for it."""
+    h, H, offset = velocity_model(s, prm)
     z, r = (m.z[0], m.z[1], m.z[2]), velocity_variance(prm, m.r)
     s.yaw.z[0], s.yaw.z[1], s.yaw.r, s.yaw.fresh = z[0] - offset[0], z[1] - offset[1], r[0], 1
     return THREE, C_VEL, z, h, r, H, prm.gate_gnss, prm.timeout_gnss, R_NONE, ANY_TURN, HARD
@@ -88,7 +105,7 @@ def offer_velocity(s: Any, prm: Any, m: Any) -> Offer:
 @jit
 def start_position(s: Any, prm: Any, m: Any, aids: Any) -> None:
     """The first fix sets position and makes its error independent of the rest."""
-    z = position_observation(s, m.z)
+    z = position_observation(s, prm, m.z)
     if not (z[0] == z[0] and z[2] == z[2]):
         return
     r = position_variance(prm, m.r)
@@ -117,7 +134,7 @@ def offer_position(s: Any, prm: Any, m: Any, aids: Any, dt: float) -> Offer:
     if s.aid[GNSS_POSITION].started == 0:
         start_position(s, prm, m, aids)
         return NOTHING
-    z = position_observation(s, m.z)
+    z = position_observation(s, prm, m.z)
     r = position_variance(prm, m.r)
     v = (s.v[0], s.v[1], s.v[2])
     jitter = dot(v, v) * dt * dt / 12.0

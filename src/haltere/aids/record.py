@@ -40,8 +40,11 @@ COMPONENTS = (
     "rate_x",
     "rate_y",
     "rate_z",
+    "field_east",
+    "field_down",
+    "field_north",
 )
-C_VEL, C_POS, C_ALTITUDE, C_HEADING, C_MAG, C_RATE = (constant(i) for i in (0, 3, 6, 7, 8, 11))
+C_VEL, C_POS, C_ALTITUDE, C_HEADING, C_MAG, C_RATE, C_FIELD = (constant(i) for i in (0, 3, 6, 7, 8, 11, 14))
 
 STATUSES = ("fused", "deweighted", "rejected", "held")
 FUSED, DEWEIGHTED, REJECTED, HELD = (constant(i) for i in range(4))

@@ -60,10 +60,13 @@ def _common(
 def _run(
     log: Log,
     estimator: Annotated[
-        str | None, typer.Option("--estimator", metavar="E", help="navigator (default) or ahrs.", show_default=False)
+        str | None, typer.Option("--estimator", metavar="E", help="navigator (default), ahrs or two-stage.", show_default=False)
     ] = None,
     preset: Annotated[
-        str | None, typer.Option("--preset", metavar="P", help="Named set of parameters: default.", show_default=False)
+        str | None,
+        typer.Option(
+            "--preset", metavar="P", help="Named set of parameters; two-stage has as-corrected and as-printed.", show_default=False
+        ),
     ] = None,
     config: Annotated[
         Path | None,

@@ -6,13 +6,15 @@ import math
 
 from haltere._jit import entry, jit
 
-__all__ = ["STANDARD_GRAVITY", "geodetic_from_local", "gravity", "local_from_geodetic", "pressure_altitude", "radii"]
+__all__ = ["STANDARD_GRAVITY", "geodetic_from_local", "gravity", "local_from_geodetic", "local_from_sphere", "pressure_altitude", "radii"]
 
 #: Gravity [m/s^2] where no position is known.
 STANDARD_GRAVITY = 9.80665
 #: WGS-84 semi-major axis [m] and first eccentricity squared.
 A_WGS84 = 6378137.0
 E2_WGS84 = 6.69437999014e-3
+#: Mean radius [m] of the spherical Earth.
+R_SPHERE = 6371008.8
 DEG = math.pi / 180.0
 
 
@@ -47,6 +49,18 @@ def local_from_geodetic(lat: float, lon: float, alt: float, lat0: float, lon0: f
         dlon * DEG * (n + alt0) * math.cos(0.5 * (lat + lat0) * DEG),
         alt0 - alt,
     )
+
+
+@jit
+def local_from_sphere(lat: float, lon: float, lat0: float, lon0: float) -> tuple[float, float]:
+    """Position north, east [m] from the origin (degrees) on a sphere by the haversine (theory.md §4.6, (7)-(8), reconstructed).
+
+    P_N = R (B - B0), P_E = sgn(L - L0) 2 R asin(cos B |sin((L - L0)/2)|): the legs through the auxiliary point (B, L0). Against the
+    ellipsoid their scale is wrong by -0.25 % to +0.15 % at 40 degrees of latitude.
+    """
+    dlon = lon - lon0
+    dlon -= 360.0 * math.floor((dlon + 180.0) / 360.0)
+    return R_SPHERE * (lat - lat0) * DEG, 2.0 * R_SPHERE * math.asin(math.cos(lat * DEG) * math.sin(0.5 * dlon * DEG))
 
 
 @jit

@@ -10,7 +10,7 @@ import math
 from typing import Any
 
 from haltere._jit import constant, jit
-from haltere.aids import compass, interference, rest
+from haltere.aids import compass, first_stage, interference, rest
 from haltere.aids.fusing import DISTRUSTED, RUNNING
 from haltere.aids.gnss import position_observation, position_variance, velocity_variance
 from haltere.aids.magnetometer import learn_field
@@ -115,7 +115,7 @@ def take_due(s: Any, prm: Any) -> bool:
                     a.t_gnss_v = m.t
                     fresh = True
             elif kind == GNSS_POSITION:
-                z = position_observation(s, m.z)
+                z = position_observation(s, prm, m.z)
                 if z[0] == z[0] and z[2] == z[2]:
                     r = position_variance(prm, m.r)
                     for j in range(3):
@@ -248,6 +248,7 @@ def start(s: Any, prm: Any, kind: int, f_b: Vec, a_n: Vec) -> None:
     s.aid[GNSS_POSITION].started = 1 if recent_p else 0
     s.aid[BAROMETER].started = 1 if s.t - a.t_baro < 2.0 else 0
     s.aid[MAGNETOMETER].started = RUNNING if passed else (DISTRUSTED if has_m and s.has_field == 1 else 0)
+    first_stage.begin(s)
     a.kind = kind
     s.phase = 2
     s.t_aligned = s.t

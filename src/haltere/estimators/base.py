@@ -115,7 +115,8 @@ class InitialState:
 
 def new_state(config: Config, initial: InitialState | None = None) -> NDArray[np.void]:
     """State record, one element, that has seen nothing yet."""
-    record = as_records(np.zeros(1, layout(1 if config["baro.offset"] == "on" else 0, 3 if config["magnetometer.refine"] == "on" else 0)))
+    offsets = 1 if config["baro.offset"] == "on" else 0, 3 if config["magnetometer.refine"] == "on" else 0
+    record = as_records(np.zeros(1, layout(*offsets, 1 if config.estimator == "two-stage" else 0)))
     record["q"][0, 0] = 1.0
     home = (config.number("home.lat"), config.number("home.lon"), config.number("home.alt"))
     record["gravity"] = STANDARD_GRAVITY
@@ -152,6 +153,9 @@ def _begin_from(record: NDArray[np.void], initial: InitialState) -> None:
         record["baro"][0, 0] = initial.baro_bias
     record["q"][0] /= np.linalg.norm(record["q"][0])
     record["P"][0] = P
+    for field in ("q", "v", "p", "bg", "ba"):
+        record["a"][field][0] = record[field][0]
+    record["a"]["P"][0] = P[:CORE, :CORE]
     record["phase"] = 2
     record["n_aligned"] = 1
     record["t_aligned"] = initial.t
@@ -168,7 +172,7 @@ class Estimator:
     Parameters
     ----------
     name
-        ``navigator`` or ``ahrs``.
+        ``navigator``, ``ahrs`` or ``two-stage``.
     config
         A complete `Config`, or a mapping of configuration keys to change. Home and field that are not given are taken from
         the first fix (origin) and from the first magnetometer samples (field); declination is then 0.

@@ -125,7 +125,8 @@ def parameters(config: Config) -> NDArray[np.void]:
     for name in PARAMETERS.names or ():
         if name in ("horizon", "covariance_interval", "imu_mean"):
             continue
-        record[name] = config.number(name.replace("_", ".", 1))
+        head = "two_stage" if name.startswith("two_stage_") else name.partition("_")[0]
+        record[name] = config.number(f"{head}.{name[len(head) + 1 :]}")
     record["imu_mean"] = config.number("imu.kind")
     record["horizon"] = horizon(config)
     record["covariance_interval"] = 0.1

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from types import ModuleType
 
-from haltere.estimators import ahrs, navigator
+from haltere.estimators import ahrs, navigator, two_stage
 
 #: Module of each estimator.
-SPECIFICATIONS: dict[str, ModuleType] = {navigator.NAME: navigator, ahrs.NAME: ahrs}
+SPECIFICATIONS: dict[str, ModuleType] = {m.NAME: m for m in (navigator, ahrs, two_stage)}

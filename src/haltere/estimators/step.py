@@ -6,7 +6,7 @@ import math
 from typing import Any
 
 from haltere._jit import entry, jit
-from haltere.aids import fake, rest
+from haltere.aids import fake, first_stage, rest
 from haltere.aids.dispatch import N_SENSORS, fuse_all
 from haltere.aids.record import (
     BAROMETER,
@@ -151,6 +151,8 @@ def sound(s: Any) -> bool:
     ok = True
     for i in range(s.P.shape[0]):
         ok = ok and s.P[i, i] > 0.0 and s.P[i, i] < 1e14
+    for i in range(len(s.a)):
+        ok = ok and first_stage.sound(s.a[i])
     return ok
 
 
@@ -188,6 +190,14 @@ def predict_interval(s: Any, prm: Any, w0: Vec, f0: Vec, w1: Vec, f1: Vec, dt: f
 
 
 @jit
+def predict_stages(s: Any, prm: Any, w0: Vec, f0: Vec, w1: Vec, f1: Vec, dt: float) -> None:
+    """Predict the first stage, where there is one, with its own biases beside the main state."""
+    for i in range(len(s.a)):
+        s.a[i].gravity = s.gravity
+        predict_interval(s.a[i], prm, w0, f0, w1, f1, dt)
+
+
+@jit
 def bridge_push(s: Any, dt: float) -> None:
     """Admit that nobody knows what happened in ``dt`` seconds without samples."""
     turn, push_v, push_p = 0.5 * dt, 3.0 * dt, 1.5 * dt * dt
@@ -204,16 +214,15 @@ def bridge_gap(s: Any, prm: Any, w0: Vec, f0: Vec, w1: Vec, f1: Vec, dt: float) 
     h = dt / n
     for i in range(n):
         k0, k1 = i / n, (i + 1) / n
-        predict_interval(
-            s,
-            prm,
-            (w0[0] + k0 * (w1[0] - w0[0]), w0[1] + k0 * (w1[1] - w0[1]), w0[2] + k0 * (w1[2] - w0[2])),
-            (f0[0] + k0 * (f1[0] - f0[0]), f0[1] + k0 * (f1[1] - f0[1]), f0[2] + k0 * (f1[2] - f0[2])),
-            (w0[0] + k1 * (w1[0] - w0[0]), w0[1] + k1 * (w1[1] - w0[1]), w0[2] + k1 * (w1[2] - w0[2])),
-            (f0[0] + k1 * (f1[0] - f0[0]), f0[1] + k1 * (f1[1] - f0[1]), f0[2] + k1 * (f1[2] - f0[2])),
-            h,
-        )
+        wa = (w0[0] + k0 * (w1[0] - w0[0]), w0[1] + k0 * (w1[1] - w0[1]), w0[2] + k0 * (w1[2] - w0[2]))
+        fa = (f0[0] + k0 * (f1[0] - f0[0]), f0[1] + k0 * (f1[1] - f0[1]), f0[2] + k0 * (f1[2] - f0[2]))
+        wb = (w0[0] + k1 * (w1[0] - w0[0]), w0[1] + k1 * (w1[1] - w0[1]), w0[2] + k1 * (w1[2] - w0[2]))
+        fb = (f0[0] + k1 * (f1[0] - f0[0]), f0[1] + k1 * (f1[1] - f0[1]), f0[2] + k1 * (f1[2] - f0[2]))
+        predict_interval(s, prm, wa, fa, wb, fb, h)
+        predict_stages(s, prm, wa, fa, wb, fb, h)
     bridge_push(s, dt)
+    for i in range(len(s.a)):
+        bridge_push(s.a[i], dt)
     event(s, s.t, E_GAP, NO_SENSOR, dt)
     s.n_gaps += 1
 
@@ -273,6 +282,7 @@ def advance(s: Any, prm: Any, rows: Any, cov: Any, aids: Any, tape: Any) -> None
             bridge_gap(s, prm, w0, f0, w1, f1, dt)
         else:
             predict_interval(s, prm, w0, f0, w1, f1, dt)
+            predict_stages(s, prm, w0, f0, w1, f1, dt)
         s.yaw.dv[0] += s.v[0] - north
         s.yaw.dv[1] += s.v[1] - east
         if t >= s.t_wake:

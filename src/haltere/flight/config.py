@@ -20,7 +20,11 @@ DEG = math.pi / 180.0
 Value = float | str | bool
 
 #: Estimators and the presets each has.
-PRESETS: dict[str, tuple[str, ...]] = {"navigator": ("default",), "ahrs": ("default",)}
+PRESETS: dict[str, tuple[str, ...]] = {
+    "navigator": ("default",),
+    "ahrs": ("default",),
+    "two-stage": ("default", "as-corrected", "as-printed"),
+}
 ESTIMATORS = tuple(PRESETS)
 
 
@@ -111,7 +115,10 @@ KEYS: dict[str, Key] = {
     "aid.gnss": _switch("on", "Use GNSS position and velocity."),
     "aid.barometer": _switch("on", "Use the barometer."),
     "aid.magnetometer": _switch(
-        "heading", "Use the magnetometer: as a heading that leaves tilt alone, or as three axes.", ("off", "heading", "3-axis")
+        "heading",
+        "Use the magnetometer: as a heading that leaves tilt alone, as three axes, or (two-stage, which has no other) as the horizontal "
+        "field orthonormal to the gravity of its first stage.",
+        ("off", "heading", "3-axis", "orthonormal"),
     ),
     "aid.zero_velocity": _switch("on", "Zero velocity at rest."),
     "aid.zero_rate": _switch("on", "Zero rate at rest."),
@@ -164,6 +171,41 @@ KEYS: dict[str, Key] = {
     "rest.gyro": _positive(0.02, "rad/s", "At rest the rate's standard deviation over a second is below this."),
     "rest.accel": _positive(0.3, "m/s^2", "At rest the standard deviation of |f| over a second is below this."),
     "rest.gravity": _positive(0.5, "m/s^2", "At rest mean |f| differs from gravity by less than this."),
+    "two_stage.tolerance": _positive(
+        math.nan,
+        "1",
+        "T_D: one unit of the anomaly index, in |F| (uT^2 where the index is algebraic). Default: the index's own 1 sigma, twice that of "
+        "the field over its strength. Higher lets more disturbed field in.",
+    ),
+    "two_stage.k1": _positive(2.0, "T_D", "Anomaly index from which the magnetometer's variance is inflated."),
+    "two_stage.k2": _positive(6.0, "T_D", "Anomaly index from which a magnetometer sample is dropped."),
+    "two_stage.robust": _switch(
+        "igg3",
+        "How the variance grows between k1 and k2; huber never drops, off takes every sample as it is.",
+        ("off", "igg3", "huber", "step"),
+    ),
+    "two_stage.index": _switch(
+        "relative",
+        "F of the anomaly index: |m|^2/|H|^2 - 1, or the algebraic |m|^2 - |H|^2 [uT^2] of the printed one.",
+        ("relative", "algebraic"),
+    ),
+    "two_stage.innovation": _switch(
+        "on", "A second factor from sqrt(NIS): two_stage.robust from robust.innovation to gate.magnetometer, where it is dropped."
+    ),
+    "two_stage.radial": _positive(
+        math.nan, "1", "Slack of the unit horizontal field along itself, which its noise does not move. Default: as much as across."
+    ),
+    "two_stage.memory": Key(
+        0.0,
+        "s",
+        "How long an error of the first stage's gravity lasts; its variance counts 2 memory/interval times. 0: each sample anew.",
+        low=0.0,
+        high=1e4,
+    ),
+    "two_stage.haversine": _switch("off", "North and east of a fix by the haversine on a sphere, as printed, instead of on WGS-84."),
+    "two_stage.height_sign": _switch(
+        "minus", "Down position of a fix is minus the height above the origin; plus is a misprint of the source.", ("minus", "plus")
+    ),
     "imu.kind": _switch("instant", "An IMU sample is the value at its time, or the mean since the sample before.", ("instant", "mean")),
     "baro.temperature": Key(
         math.nan, "K", "Air temperature at the ground, scales pressure altitude. Default: standard atmosphere.", low=200.0, high=330.0
@@ -196,13 +238,58 @@ GROUPS: dict[str, tuple[str, ...]] = {
     "axes.imu": ("axes.gyro", "axes.accel"),
 }
 
+_TWO_STAGE = tuple(key for key in KEYS if key.startswith("two_stage."))
 #: What an estimator sets differently from the defaults above.
 _OVERRIDES: dict[str, dict[str, Value]] = {
     "navigator": {},
     "ahrs": {"aid.gnss": "off", "aid.barometer": "off", "aid.fake_velocity": "on", "baro.offset": "off"},
+    "two-stage": {
+        "aid.magnetometer": "orthonormal", "aid.barometer": "off", "baro.offset": "off", "aid.fake_velocity": "off",
+        "aid.zero_velocity": "off", "aid.zero_rate": "off", "aid.yaw_bank": "off", "aid.compass_watch": "off",
+        "aid.motor_field": "off", "two_stage.radial": 0.05, "two_stage.memory": 10.0,
+    },
+}  # fmt: skip
+_NO_GATE = 1e6
+#: What a preset of an estimator sets differently from its `default`. The source has no innovation tests.
+_PRESET_OVERRIDES: dict[tuple[str, str], dict[str, Value]] = {
+    ("two-stage", "as-corrected"): {
+        "two_stage.tolerance": 0.03, "two_stage.innovation": "off", "two_stage.radial": math.nan,
+        "two_stage.memory": 0.0, "two_stage.haversine": "on",
+        "gate.gnss": _NO_GATE, "gate.magnetometer": _NO_GATE, "noise.field": 0.0, "noise.gyro_scale": 0.0,
+    },
+}  # fmt: skip
+_PRESET_OVERRIDES["two-stage", "as-printed"] = _PRESET_OVERRIDES["two-stage", "as-corrected"] | {
+    "two_stage.index": "algebraic",
+    "two_stage.height_sign": "plus",
 }
-#: Keys that an estimator does not have: changing them would change nothing.
-_FIXED: dict[str, tuple[str, ...]] = {"navigator": (), "ahrs": tuple(_OVERRIDES["ahrs"])}
+#: Keys that an estimator does not have: changing them would change nothing, or make it another one.
+_FIXED: dict[str, tuple[str, ...]] = {
+    "navigator": _TWO_STAGE,
+    "ahrs": (*_OVERRIDES["ahrs"], *_TWO_STAGE),
+    "two-stage": (
+        "aid.barometer",
+        "baro.offset",
+        "aid.fake_velocity",
+        "aid.zero_velocity",
+        "aid.zero_rate",
+        "aid.yaw_bank",
+        "aid.compass_watch",
+        "aid.motor_field",
+        "magnetometer.refine",
+        "noise.mag_offset",
+        "init.mag_offset",
+        "robust.strength",
+        "robust.dip",
+        "robust.heading",
+        "robust.calibration",
+    ),
+}
+#: Words of a switch that an estimator does not have.
+_LACKS: dict[str, dict[str, tuple[str, ...]]] = {
+    "navigator": {"aid.magnetometer": ("orthonormal",)},
+    "ahrs": {"aid.magnetometer": ("orthonormal",)},
+    "two-stage": {"aid.magnetometer": ("heading", "3-axis")},
+}
 
 
 @dataclass(frozen=True)
@@ -244,11 +331,14 @@ def defaults(estimator: str = "navigator", preset: str = "default") -> dict[str,
         hint = f"did you mean {near[0]!r}?" if near else f"one of {', '.join(ESTIMATORS)}"
         raise UsageError("an estimator", repr(estimator), "--estimator", hint)
     if preset not in PRESETS[estimator]:
+        alone = f"{estimator} is not one of the published designs, so it has no printed or corrected form"
         raise UsageError(
-            f"a preset of {estimator} ({', '.join(PRESETS[estimator])})", repr(preset), "--preset",
-            f"{estimator} is not one of the published designs, so it has no printed or corrected form",
-        )  # fmt: skip
-    return {key: spec.default for key, spec in KEYS.items()} | _OVERRIDES[estimator]
+            f"a preset of {estimator} ({', '.join(PRESETS[estimator])})",
+            repr(preset),
+            "--preset",
+            alone if len(PRESETS[estimator]) == 1 else "",
+        )
+    return {key: spec.default for key, spec in KEYS.items()} | _OVERRIDES[estimator] | _PRESET_OVERRIDES.get((estimator, preset), {})
 
 
 def _check(key: str, value: Any, where: str) -> Value:
@@ -292,9 +382,16 @@ def resolve(estimator: str = "navigator", preset: str = "default", overrides: Ma
     for key, value in (overrides or {}).items():
         for name in GROUPS.get(key, (key,)):
             checked = _check(name, value, where)
-            if name in _FIXED[estimator] and checked != values[name]:
+            same = checked == values[name] or (checked != checked and values[name] != values[name])
+            if name in _FIXED[estimator] and not same:
                 raise UsageError(f"a key that {estimator} has", repr(name), where, f"{estimator} keeps it at {values[name]}")
+            if checked in _LACKS[estimator].get(name, ()):
+                left = [w for w in KEYS[name].words if w not in _LACKS[estimator][name]]
+                raise UsageError(f"{name} of {estimator} to be {' or '.join(left)}", repr(checked), where)
             values[name] = checked
+    if estimator == "two-stage" and not float(values["two_stage.k1"]) < float(values["two_stage.k2"]):
+        found = f"{values['two_stage.k1']} and {values['two_stage.k2']}"
+        raise UsageError("two_stage.k1 below two_stage.k2", found, where, "the variance is inflated between them")
     return Config(estimator, preset, values)
 
 

@@ -278,4 +278,5 @@ def _rotors(out: _Judgement) -> None:
 ESTIMATORS: dict[str, tuple[Callable[[_Judgement], None], ...]] = {
     "navigator": (_attitude, _velocity_and_position, _height, _heading_or_course, _rotors),
     "ahrs": (_level, _heading),
+    "two-stage": (_attitude, _velocity_and_position, _heading_or_course),
 }

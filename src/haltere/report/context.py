@@ -40,6 +40,7 @@ COMPONENTS: dict[str, tuple[str, str, float, float]] = {
     "heading": ("heading", "deg", 180.0 / math.pi, 1e-3),
     **{f"mag_{a}": (f"field {a}", "µT", 1.0, 1e-2) for a in "xyz"},
     **{f"rate_{a}": (f"rate {a}", "deg/s", 180.0 / math.pi, 1e-3) for a in "xyz"},
+    **{f"field_{a}": (f"unit field {a}", "1", 1.0, 1e-4) for a in ("east", "down", "north")},
 }
 
 

@@ -27,6 +27,7 @@ __all__ = [
     "PARAMETERS",
     "POS",
     "REST",
+    "STAGE",
     "THETA",
     "VEL",
     "layout",
@@ -200,6 +201,24 @@ MOTORS = _record(
 #: ``onset`` and ``threshold`` where there is one, else the time itself and NaN.
 EVENT = _record(("t", "f8"), ("onset", "f8"), ("code", "i8"), ("sensor", "i8"), ("value", "f8"), ("threshold", "f8"), ("detail", "i8"))
 
+#: A first stage: the part of a state that prediction and updates touch, with the core states only.
+STAGE = _record(
+    ("q", "f8", 4),
+    ("v", "f8", 3),
+    ("p", "f8", 3),
+    ("bg", "f8", 3),
+    ("ba", "f8", 3),
+    ("baro", "f8", (0,)),
+    ("mag", "f8", (0,)),
+    ("P", "f8", (CORE, CORE)),
+    ("dx", "f8", CORE),
+    ("u", "f8", CORE),
+    ("k", "f8", CORE),
+    ("w", "f8", 3),
+    ("yaw_corrected", "f8"),
+    ("gravity", "f8"),
+)
+
 #: Every number a filter is told. Field ``noise_gyro`` is configuration key ``noise.gyro``.
 PARAMETERS = np.dtype(
     [
@@ -220,6 +239,9 @@ PARAMETERS = np.dtype(
             "init_tilt_rest init_tilt_motion init_yaw_compass init_yaw_unknown init_gyro_bias_rest init_gyro_bias "
             "init_accel_bias init_velocity init_baro_bias init_mag_offset "
             "rest_gyro rest_accel rest_gravity "
+            "two_stage_tolerance two_stage_k1 two_stage_k2 two_stage_robust two_stage_index two_stage_innovation "
+            "two_stage_radial two_stage_memory "
+            "two_stage_haversine two_stage_height_sign "
             "imu_mean horizon covariance_interval"
         ).split()
     ],
@@ -228,7 +250,7 @@ PARAMETERS = np.dtype(
 
 
 @cache
-def layout(baro: int = 0, mag: int = 0) -> np.dtype[np.void]:
+def layout(baro: int = 0, mag: int = 0, stages: int = 0) -> np.dtype[np.void]:
     """State record type.
 
     Parameters
@@ -237,6 +259,8 @@ def layout(baro: int = 0, mag: int = 0) -> np.dtype[np.void]:
         1 with the barometer offset as a state, else 0.
     mag
         3 with the offset of the magnetometer as states, else 0.
+    stages
+        1 with a first stage beside the main state (`two-stage`), else 0.
 
     Returns
     -------
@@ -298,6 +322,7 @@ def layout(baro: int = 0, mag: int = 0) -> np.dtype[np.void]:
             ("imu_head", "i8"),
             ("imu_n", "i8"),
             ("imu", IMU_SAMPLE, (IMU_CAPACITY,)),
+            ("a", STAGE, (stages,)),
             ("ring_head", "i8", 5),
             ("ring_n", "i8", 5),
             ("ring", MEASUREMENT, (5, MEASUREMENT_CAPACITY)),
