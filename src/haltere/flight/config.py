@@ -162,7 +162,16 @@ KEYS: dict[str, Key] = {
         "The same for the accelerometer. `BLU`, all three turned over, is one that gives gravity instead of specific force."
     ),
     "axes.magnetometer": _axes("The same for the magnetometer."),
-}
+    **{f"magnetometer.offset_{a}": Key(0.0, "uT", doc) for a, doc in (
+        ("x", "Offset b of the magnetometer: m = A (m_raw - b - k load), in the sensor's axes, after unit and axes were put right. m_raw is "
+         "the field before the autopilot's own correction where the log tells it. `haltere calibrate magnetometer` finds it."),
+        ("y", "The same along y."), ("z", "The same along z."))},
+    **{f"magnetometer.matrix_{r}{c}": Key(float(r == c), "1", f"Matrix A of the magnetometer, {r} from {c}.") for r in "xyz" for c in "xyz"},
+    "magnetometer.load": _switch(
+        "off", "What the magnetometer's offset follows: the battery's current, the mean rotor command, or the mean rotor speed.",
+        ("off", "current", "throttle", "rotors")),
+    **{f"magnetometer.load_{a}": Key(0.0, "uT/A, uT or uT/(rad/s)", f"Field k a unit of that load, along {a}.") for a in "xyz"},
+}  # fmt: skip
 
 #: Keys that stand for several, each with what it sets.
 GROUPS: dict[str, tuple[str, ...]] = {
