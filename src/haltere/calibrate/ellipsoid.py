@@ -101,7 +101,9 @@ def fit(m: FloatArray, method: str = "sampson", load: FloatArray | None = None, 
         raise UsageError(f"a method: {', '.join(METHODS)}", repr(method), "--method", nearest(method, METHODS))
     m = np.asarray(m, dtype=np.float64)
     if m.ndim != 2 or m.shape[1] != 3 or not np.isfinite(m).all():
-        raise HaltereError("finite vectors of shape (n, 3)", f"shape {m.shape}" if m.ndim != 2 or m.shape[1] != 3 else "some not finite", "fit")
+        raise HaltereError(
+            "finite vectors of shape (n, 3)", f"shape {m.shape}" if m.ndim != 2 or m.shape[1] != 3 else "some not finite", "fit"
+        )
     if len(m) < FEWEST:
         raise HaltereError(f"at least {FEWEST} vectors", f"{len(m)}", "fit", "turn the sensor through all directions while recording")
     middle = m.mean(axis=0)

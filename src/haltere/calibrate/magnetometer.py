@@ -17,7 +17,7 @@ from haltere.calibrate.dip import Turn, turn
 from haltere.calibrate.ellipsoid import BASIS, METHODS, Ellipsoid, fit
 from haltere.errors import HaltereError, UsageError, nearest
 from haltere.estimators.inputs import request
-from haltere.flight.config import Config
+from haltere.flight.config import KEYS, Config
 from haltere.flight.corrections import CALIBRATION, correct, mounting_matrix, raw_vectors
 from haltere.flight.door import first_fix
 from haltere.flight.field import decimal_year, earth_field
@@ -38,6 +38,8 @@ DIP_ASSUMED = math.radians(60.0)
 STRENGTH_SD = 0.005
 #: Least range of a load that can be told from an offset: between its 1st and 99th percentile, in its unit.
 LEAST_RANGE = {"current": 1.0, "throttle": 0.1, "rotors": 20.0}
+#: Keys of the configuration that a run needs besides the calibration.
+GIVEN = ("unit.magnetometer", "axes.magnetometer")
 #: Chance of taking a load for real that is none.
 LOAD_CHANCE = 1e-3
 
@@ -76,6 +78,8 @@ class MagnetometerCalibration:
         Whether the log was corrected by its autopilot, and ``raw`` had that undone.
     sensor
         What autopilot parameters the stream belongs to: keys of ``FlightMeta.compass``.
+    given
+        Keys of the magnetometer's unit and axes that were set, which a run needs too.
     refused
         Why it is not to be used; empty where it may be.
     notes
@@ -106,6 +110,7 @@ class MagnetometerCalibration:
     heading_sd: FloatArray
     undone: bool
     sensor: Mapping[str, Any]
+    given: Mapping[str, str]
     refused: str
     notes: tuple[str, ...] = field(default=())
 
@@ -135,11 +140,26 @@ class MagnetometerCalibration:
 
 
 class CoverageError(HaltereError):
-    """A log that does not turn the sensor enough; ``calibration`` is what came out nevertheless, to be looked at."""
+    """A log that does not turn the sensor enough.
 
-    def __init__(self, expected: str, found: str, where: str, remedy: str, calibration: MagnetometerCalibration) -> None:
+    Attributes
+    ----------
+    calibration
+        What came out nevertheless, to be looked at; None where no ellipsoid could be fitted.
+    raw
+        The vectors (n, 3) [µT].
+    """
+
+    def __init__(
+        self, expected: str, found: str, where: str, remedy: str, calibration: MagnetometerCalibration | None, raw: FloatArray
+    ) -> None:
         super().__init__(expected, found, where, remedy)
         self.calibration = calibration
+        self.raw = raw
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        """The same in another process."""
+        return type(self), (self.expected, self.found, self.where, self.remedy, self.calibration, self.raw)
 
 
 def calibrate_magnetometer(
@@ -199,7 +219,11 @@ def calibrate_magnetometer(
     strength, dip, source = _field(flight, plain)
 
     word, u = _load(flight, load if method == "sampson" else "off", t, notes)
-    ellipsoid = fit(raw, method, u)
+    try:
+        ellipsoid = fit(raw, method, u)
+    except HaltereError as error:
+        where = f"{flight.meta.name or 'flight'}, {stream}"
+        raise CoverageError(error.expected, error.found, where, error.remedy, None, raw) from None
     if u is not None and load == "auto" and not _real(ellipsoid, u, word, notes):
         word, u = "off", None
         ellipsoid = fit(raw, method)
@@ -228,11 +252,11 @@ def calibrate_magnetometer(
     out = MagnetometerCalibration(
         flight.meta.name, stream, method, ellipsoid.centre, A, word, ellipsoid.load, covariance, scale * ellipsoid.shape, found, scale, dip,
         source, ellipsoid, seen, t, log, raw, values, calibrated, _before(log, calibrated, fields, C), sd, undone,
-        flight.meta.compass.get(stream, {}), poor, tuple(notes),
+        flight.meta.compass.get(stream, {}), {k: str(plain[k]) for k in GIVEN if plain[k] != KEYS[k].default}, poor, tuple(notes),
     )  # fmt: skip
     if poor:
         raise CoverageError(
-            "a sensor turned through enough directions", poor, f"{flight.meta.name or 'flight'}, {stream}", _advice(seen), out
+            "a sensor turned through enough directions", poor, f"{flight.meta.name or 'flight'}, {stream}", _advice(seen), out, raw
         )
     return out
 
@@ -244,7 +268,10 @@ def _samples(flight: FlightLog, stream: str, notes: list[str]) -> tuple[FloatArr
     if mag is None:
         have = [s for s in flight if s.startswith("magnetometer")]
         raise HaltereError(
-            f"the stream {stream}", f"only {', '.join(flight)}", where, f"there is {', '.join(have)}" if have else "give a column map (--column)"
+            f"the stream {stream}",
+            f"only {', '.join(flight)}",
+            where,
+            f"there is {', '.join(have)}" if have else "give a column map (--column)",
         )
     log = mag.vector("mag")
     raw, undone = raw_vectors(mag)
@@ -291,7 +318,9 @@ def _load(flight: FlightLog, wanted: str, t: FloatArray, notes: list[str]) -> tu
         unit = LOADS[word][0]
         text = f"{word} varies by {high - low:.2g} {unit} only: its field cannot be told from an offset"
         if wanted != "auto":
-            raise HaltereError(f"a {word} that varies by more than {LEAST_RANGE[word]:g} {unit}", f"{high - low:.2g} {unit}", flight.meta.name)
+            raise HaltereError(
+                f"a {word} that varies by more than {LEAST_RANGE[word]:g} {unit}", f"{high - low:.2g} {unit}", flight.meta.name
+            )
         notes.append(text)
     return "off", None
 
@@ -390,4 +419,6 @@ def _judge(seen: Coverage, sd: FloatArray, sigma: float, notes: list[str]) -> st
 
 def _advice(seen: Coverage) -> str:
     what = f"; the field never came from near {', '.join(seen.missing)} in the sensor's axes" if seen.missing else ""
-    return f"{100.0 * seen.share:.0f} % of the directions were seen{what}: roll and pitch further, or rotate it by hand through all attitudes"
+    return (
+        f"{100.0 * seen.share:.0f} % of the directions were seen{what}: roll and pitch further, or rotate it by hand through all attitudes"
+    )
