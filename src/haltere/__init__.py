@@ -78,8 +78,8 @@ if TYPE_CHECKING:
     from haltere.simulate import Scenario, inject, simulate
 
 __all__ = [
-    "Estimator", "FlightLog", "FlightMeta", "HaltereError", "Home", "Scenario", "Solution", "Stream", "__version__", "calibrate_magnetometer",
-    "campaign", "compare", "inject", "read", "run", "simulate",
+    "Estimator", "FlightLog", "FlightMeta", "HaltereError", "Home", "Scenario", "Solution", "Stream", "__version__",
+    "calibrate_magnetometer", "campaign", "compare", "inject", "read", "run", "simulate",
 ]  # fmt: skip
 
 # Where each public name lives: loaded at its first use, so that `import haltere` costs no numba, polars or scipy.

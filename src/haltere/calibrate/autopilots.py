@@ -78,9 +78,7 @@ def remarks(c: MagnetometerCalibration) -> list[str]:
     """What to know before pasting."""
     out = []
     if not c.sensor:
-        out.append(
-            "the log does not name its autopilot's parameters: those of the first compass are written, for a sensor that is not turned"
-        )
+        out.append("the log does not name its autopilot's parameters: those of the first compass are written, for a sensor not turned")
     if c.undone:
         out.append(f"the log's own correction ({c.sensor.get('autopilot', 'autopilot')}) was undone first: these replace it")
     elif c.sensor.get("autopilot") == "PX4" or not c.sensor:
@@ -89,8 +87,8 @@ def remarks(c: MagnetometerCalibration) -> list[str]:
         angle = math.degrees(float(np.linalg.norm(c.turn.vector)))
         sd = math.degrees(math.sqrt(float(np.trace(c.turn.covariance)) / 3.0))
         out.append(
-            f"the rotation against the IMU, {angle:.1f} deg (1 sigma {sd:.1f} deg an axis), is not in them: the autopilots take a symmetric matrix; "
-            "calibration.toml has it"
+            f"the rotation against the IMU, {angle:.1f} deg (1 sigma {sd:.1f} deg an axis), is not in them: autopilots take a symmetric "
+            "matrix; calibration.toml has it"
         )
     if c.load_word == "rotors":
         out.append("neither autopilot has a compensation by rotor speed: calibration.toml has it")

@@ -15,7 +15,7 @@ __all__ = ["PRIOR", "Turn", "turn"]
 
 FloatArray = NDArray[np.float64]
 
-#: 1 sigma of the residual rotation about each axis before the flight is looked at [rad]: sensors are fitted, and soft iron turns, by a degree or two.
+#: 1 sigma of the residual rotation about each axis before the flight is looked at [rad]: mounting and soft iron turn by a degree or two.
 PRIOR = math.radians(2.0)
 #: 1 sigma of the dip of the World Magnetic Model at a place [rad]: 0.2 deg of the model, the rest local.
 DIP_SD = math.radians(0.5)
@@ -67,7 +67,7 @@ def turn(ellipsoid: Ellipsoid, m: FloatArray, down: FloatArray, u: FloatArray | 
     m
         Vectors (n, 3), in order of time.
     down
-        Unit vectors of gravity's direction (n, 3) in the sensor's axes, from a filter that does not use the magnetometer; NaN where unknown.
+        Unit vectors of gravity's direction (n, 3) in the sensor's axes, of a filter that does not use the magnetometer; NaN: unknown.
     u
         Loads (n,).
     dip

@@ -1,4 +1,4 @@
-"""The ellipsoid on which a magnetometer's vectors lie: four fits, robust weights and the fit's own covariance. It knows no sensor and no unit."""
+"""The ellipsoid on which a magnetometer's vectors lie: four fits, robust weights, covariance. It knows no sensor and no unit."""
 
 from __future__ import annotations
 
@@ -64,7 +64,7 @@ class Ellipsoid:
 
     def __call__(self, m: FloatArray, u: FloatArray | float = 0.0) -> FloatArray:
         """Vectors (n, 3) on the unit sphere, at loads (n,)."""
-        return (m - self.centre - np.multiply.outer(np.broadcast_to(u, len(m)), self.load)) @ self.shape.T
+        return np.asarray((m - self.centre - np.multiply.outer(np.broadcast_to(u, len(m)), self.load)) @ self.shape.T)
 
 
 def fit(m: FloatArray, method: str = "sampson", load: FloatArray | None = None, *, robust: bool = True) -> Ellipsoid:

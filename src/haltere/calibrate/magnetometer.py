@@ -23,6 +23,7 @@ from haltere.flight.door import first_fix
 from haltere.flight.field import decimal_year, earth_field
 from haltere.flight.load import LOADS, load_at, loads_of
 from haltere.flight.log import FlightLog
+from haltere.readers.table import ROWS
 
 __all__ = ["CoverageError", "MagnetometerCalibration", "calibrate_magnetometer"]
 
@@ -213,7 +214,7 @@ def calibrate_magnetometer(
     asked = request(flight, "navigator", "default", config, set).values
     plain = {k: v for k, v in asked.items() if k not in CALIBRATION}
     flight = correct(flight, plain)
-    notes: list[str] = []
+    notes: list[str] = [n for n in flight.notes if n == ROWS]
     t, log, raw, undone = _samples(flight, stream, notes)
     C = mounting_matrix(flight, stream)
     strength, dip, source = _field(flight, plain)
@@ -267,12 +268,8 @@ def _samples(flight: FlightLog, stream: str, notes: list[str]) -> tuple[FloatArr
     where = flight.meta.name or "flight"
     if mag is None:
         have = [s for s in flight if s.startswith("magnetometer")]
-        raise HaltereError(
-            f"the stream {stream}",
-            f"only {', '.join(flight)}",
-            where,
-            f"there is {', '.join(have)}" if have else "give a column map (--column)",
-        )
+        remedy = f"there is {', '.join(have)}" if have else "give a column map (--column)"
+        raise HaltereError(f"the stream {stream}", f"only {', '.join(flight)}", where, remedy)
     log = mag.vector("mag")
     raw, undone = raw_vectors(mag)
     good = np.isfinite(mag.t) & np.isfinite(log).all(axis=1) & np.isfinite(raw).all(axis=1) & (log != 0.0).any(axis=1)
@@ -338,7 +335,7 @@ def _real(e: Ellipsoid, u: FloatArray, word: str, notes: list[str]) -> bool:
 def _gravity(
     flight: FlightLog, config: Mapping[str, Any], t: FloatArray, stream: str, C: FloatArray, notes: list[str]
 ) -> FloatArray | None:
-    """Direction of gravity in the sensor's axes (n, 3) from the navigator without magnetometer; NaN where its tilt is not known to 3 deg."""
+    """Direction of gravity in the sensor's axes (n, 3) from the navigator without magnetometer; NaN where tilt is not known to 3 deg."""
     from haltere.drive import run
 
     if "imu" not in flight:
@@ -411,8 +408,8 @@ def _judge(seen: Coverage, sd: FloatArray, sigma: float, notes: list[str]) -> st
         return f"directions that scatter by {least:.2g} at least (eigenvalue; {bound:.2g} wanted at this noise)"
     if worst > HEADING_POOR or least < SCATTER_POOR:
         notes.append(
-            f"poor coverage: level headings are known to {math.degrees(worst):.1f} deg (1 sigma) at worst, directions scatter by {least:.2g} "
-            f"at least (eigenvalue; {SCATTER_POOR:g} is good, 0.33 the whole sphere)"
+            f"poor coverage: level headings are known to {math.degrees(worst):.1f} deg (1 sigma) at worst, "
+            f"directions scatter by {least:.2g} at least (eigenvalue; {SCATTER_POOR:g} is good, 0.33 the whole sphere)"
         )
     return ""
 

@@ -162,7 +162,7 @@ app.add_typer(calibrate, name="calibrate", short_help="Calibrate a magnetometer 
 @calibrate.command(
     "magnetometer",
     short_help="Offset, matrix, load, rotation.",
-    help="Fit offset, matrix, field of the motors and rotation against the IMU of a magnetometer from a flight or from being turned by hand; "
+    help="Fit offset, matrix, field of the motors and rotation against the IMU of a magnetometer, from a flight or turning it by hand; "
     "write parameters for haltere, PX4 and ArduPilot with their uncertainty, and a page. Refused where too few directions were seen.",
 )
 def _calibrate_magnetometer(
@@ -175,9 +175,7 @@ def _calibrate_magnetometer(
     ] = None,
     set_: Annotated[
         list[str] | None,
-        typer.Option(
-            "--set", metavar="KEY=VALUE", help="One configuration key, e.g. field.strength=48. May be repeated.", show_default=False
-        ),
+        typer.Option("--set", metavar="KEY=VALUE", help="One key, e.g. field.strength=48. May be repeated.", show_default=False),
     ] = None,
     out: Annotated[
         Path | None, typer.Option("--out", metavar="DIR", help="Folder to write. Default: ./<log>.haltere", show_default=False)
@@ -190,8 +188,8 @@ def _calibrate_magnetometer(
     from haltere.cli.calibrate import magnetometer
 
     magnetometer(
-        log, method=method, load=load, stream=stream, config=config, assignments=set_ or [], out=out, columns=columns, column=column, json=json,
-        show=open_,
+        log, method=method, load=load, stream=stream, config=config, assignments=set_ or [], out=out, columns=columns, column=column,
+        json=json, show=open_,
     )  # fmt: skip
 
 

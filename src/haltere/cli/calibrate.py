@@ -137,7 +137,7 @@ def _lines(c: MagnetometerCalibration, folder: Path) -> list[str]:
     out = [
         f"{c.name or 'log'}: {c.stream}, method {c.method}, {len(c.t)} samples, {int((~c.used).sum())} outliers",
         f"strength spreads by {100.0 * c.spread(c.log):.2g} % as logged, {100.0 * c.spread(c.calibrated):.2g} % calibrated",
-        f"level headings are off by up to {DEG * max(abs(c.heading_before)):.2g} deg as logged, uncertain by up to "
+        f"level headings are off by up to {DEG * max(abs(c.heading_before)):.1f} deg as logged, uncertain by up to "
         f"{DEG * max(c.heading_sd):.2g} deg (1 sigma) calibrated",
         "offset [uT]: " + ", ".join(f"{v:.2f} ± {s:.2g}" for v, s in zip(c.offset, sd[:3], strict=True)),
     ]

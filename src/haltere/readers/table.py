@@ -20,9 +20,11 @@ from haltere.readers._common import FloatArray, unusable
 if TYPE_CHECKING:
     import polars as pl
 
-__all__ = ["UNITS", "bare_vectors", "read", "sniff"]
+__all__ = ["ROWS", "UNITS", "bare_vectors", "read", "sniff"]
 
 PARQUET = b"PAR1"
+#: What is said of a table without time.
+ROWS = "the table has no time: t is the number of the row"
 #: Streams whose columns are recognised without the stream's name.
 BARE_STREAMS = tuple(name for name in STREAMS if name not in ("onboard", "truth"))
 EXAMPLE = 'e.g. {"imu.t": "time_us [us]", "imu.gyro_x": "gx [deg/s]", "imu.accel_x": "ax [g]"}'
@@ -76,6 +78,8 @@ def read(path: Path, column_map: Mapping[str, str] | None = None) -> FlightLog:
     wanted = _from_map(column_map, table, path) if column_map is not None else _from_names(table, path, notes)
     discarded: dict[str, dict[str, int]] = {}
     streams: dict[str, dict[str, FloatArray]] = {}
+    if any(columns["t"][0] == "#row" for columns in wanted.values()):
+        notes.append(ROWS)
     for stream, columns in wanted.items():
         values = {name: _values(table, source, unit, column_unit(stream, name), path) for name, (source, unit) in columns.items()}
         t = values.pop("t")

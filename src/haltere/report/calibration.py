@@ -1,4 +1,4 @@
-"""The page of a magnetometer's calibration: verdict, sphere and strength before and after, headings, coverage, parameters. It fits nothing."""
+"""The page of a magnetometer's calibration: verdict, sphere, strength, headings, coverage, parameters. It fits nothing."""
 
 from __future__ import annotations
 
@@ -13,6 +13,7 @@ from haltere.calibrate.coverage import AZIMUTHS, BANDS, HEADINGS
 from haltere.calibrate.files import to_toml
 from haltere.calibrate.magnetometer import CoverageError, MagnetometerCalibration
 from haltere.flight.load import LOADS
+from haltere.readers.table import ROWS
 from haltere.report.document import document
 from haltere.report.grid import Grid
 from haltere.report.markup import Section, escape, section_html, table
@@ -75,8 +76,8 @@ def refused_page(error: CoverageError, name: str) -> str:
 def _verdict(level: str, badge: str, headline: str, sentences: list[str], title: str) -> str:
     items = "".join(f"<li>{escape(s)}</li>" for s in sentences)
     return (
-        f'<header><h1>{escape(title)}</h1>\n<section class="verdict {level}" id="verdict"><p class="headline"><span class="badge">{badge}</span> '
-        f"{escape(headline)}</p>{f'<ul>{items}</ul>' if items else ''}</section></header>"
+        f'<header><h1>{escape(title)}</h1>\n<section class="verdict {level}" id="verdict"><p class="headline">'
+        f'<span class="badge">{badge}</span> {escape(headline)}</p>{f"<ul>{items}</ul>" if items else ""}</section></header>'
     )
 
 
@@ -84,7 +85,7 @@ def _header(c: MagnetometerCalibration) -> str:
     worst, before = DEG * float(np.max(c.heading_sd)), DEG * float(np.max(np.abs(c.heading_before)))
     spread = (
         f"strength spreads by {100.0 * c.spread(c.log):.2g} % as logged and {100.0 * c.spread(c.calibrated):.2g} % calibrated; "
-        f"level headings are off by up to {before:.2g}° as logged, and uncertain by up to {worst:.2g}° (1σ) calibrated"
+        f"level headings are off by up to {before:.1f}° as logged, and uncertain by up to {worst:.2g}° (1σ) calibrated"
     )
     poor = any(n.startswith("poor coverage") for n in c.notes)
     level, badge = ("bad", "refused") if c.refused else ("doubtful", "poor coverage") if poor else ("good", "calibrated")
@@ -107,8 +108,8 @@ def _views(clouds: dict[str, tuple[str, FloatArray]], radius: float | None) -> F
         s = "" if panel == 0 else str(panel + 1)
         x, y = (f"x{s}", f"y{s}")
         layout[f"xaxis{s}"] = {
-            **AXES, "domain": [panel * 0.35, panel * 0.35 + 0.29], "anchor": y, "nticks": 6, "title": {"text": f"{'xyz'[i]} [µT]", "standoff": 4},
-            "constrain": "domain",
+            **AXES, "domain": [panel * 0.35, panel * 0.35 + 0.29], "anchor": y, "nticks": 6, "constrain": "domain",
+            "title": {"text": f"{'xyz'[i]} [µT]", "standoff": 4},
         }  # fmt: skip
         layout[f"yaxis{s}"] = {
             **AXES, "anchor": x, "scaleanchor": x, "nticks": 6, "title": {"text": f"{'xyz'[k]} [µT]", "standoff": 4}, "constrain": "domain",
@@ -160,7 +161,10 @@ def _strength(c: MagnetometerCalibration, pool: Pool) -> Section:
     if with_load:
         panels.line(1, c.load_word, "imu", c.t, c.load_values, unit=LOADS[c.load_word][0], width=1.0)
     note = f"Spread (1σ over mean): {100.0 * c.spread(c.log):.2g} % as logged, {100.0 * c.spread(c.calibrated):.2g} % calibrated."
-    return Section("strength", "Strength", note, [panels.figure()])
+    figure = panels.figure()
+    if ROWS in c.notes:
+        figure["layout"]["xaxis"]["title"]["text"] = "sample"
+    return Section("strength", "Strength", note, [figure])
 
 
 def _headings(c: MagnetometerCalibration) -> Section:
@@ -172,9 +176,11 @@ def _headings(c: MagnetometerCalibration) -> Section:
         return np.append(v, v[0])
 
     sd, before = closed(DEG * c.heading_sd), closed(DEG * c.heading_before)
-    grid.line(0, "as logged", "onboard", x, before, width=1.9, hover="%{y:.2~f}°")
+    jumps = np.flatnonzero(np.abs(np.diff(before)) > 180.0) + 1  # from 180 to -180 deg
+    grid.line(0, "as logged", "onboard", np.insert(x, jumps, np.nan), np.insert(before, jumps, np.nan), width=1.9, hover="%{y:.2~f}°")
     grid.line(0, "calibrated, ±1σ", "magnetometer", x, sd, hover="±%{y:.2~f}°")
     grid.line(0, "calibrated, ±1σ", "magnetometer", x, -sd, hover="")
+    grid.layout["xaxis"]["tickvals"] = list(range(0, 361, 45))
     reach = 1.08 * max(float(np.max(np.abs(before))), float(np.max(sd)))
     grid.range(0, -reach, reach)
     grid.x_range(0.0, 360.0)
@@ -193,10 +199,14 @@ def _coverage(c: MagnetometerCalibration) -> Section:
     counts = c.coverage.cells
     layout = {
         "margin": {"l": LEFT, "r": 12, "t": TOP, "b": FOOT}, "hovermode": "closest",
-        "xaxis": {**AXES, "range": [0.0, 360.0], "title": {"text": "azimuth of the field in the sensor [deg]: 0 forward, 90 right", "standoff": 4},
-                  "tickvals": list(range(0, 361, 45))},
-        "yaxis": {**AXES, "tickvals": [round(float(e), 1) for e in elevation], "title": {"text": "below the horizontal [deg]", "standoff": 6},
-                  "autorange": "reversed"},
+        "xaxis": {
+            **AXES, "range": [0.0, 360.0], "tickvals": list(range(0, 361, 45)),
+            "title": {"text": "azimuth of the field in the sensor [deg]: 0 forward, 90 right", "standoff": 4},
+        },
+        "yaxis": {
+            **AXES, "tickvals": [round(float(e), 1) for e in elevation], "autorange": "reversed",
+            "title": {"text": "below the horizontal [deg]", "standoff": 6},
+        },
     }  # fmt: skip
     trace = {
         "type": "heatmap", "x": azimuth.tolist(), "y": [round(float(e), 1) for e in elevation],
@@ -240,10 +250,15 @@ def _values(c: MagnetometerCalibration) -> Section:
     section = Section("values", "Parameters")
     section.note = f"m = matrix (m_raw − offset{' − load u' if c.load_word != 'off' else ''}), in the sensor's axes."
     section.after = table(("parameter", "value", "1σ", "unit "), rows)
+    gravity = (
+        "gravity gave; what the flight did not tell of it stays at zero with an assumed 1σ of 2° an axis"
+        if c.turn is not None
+        else "nothing in this log tells: the symmetric matrix is given"
+    )
     section.after += (
-        f"<p>{len(c.t):,} samples, {int((~c.used).sum())} of them left out as outliers; 1σ counts {100.0 * c.ellipsoid.independent:.2g} % of "
-        "them as independent, from how successive residuals resemble each other. An ellipsoid fixes the matrix up to a rotation, which "
-        f"{'gravity gave; what the flight did not tell of it stays at zero with an assumed 1σ of 2° an axis' if c.turn is not None else 'nothing in this log tells: the symmetric matrix is given'}.</p>"
+        f"<p>{len(c.t):,} samples, {int((~c.used).sum())} of them left out as outliers; 1σ counts "
+        f"{100.0 * c.ellipsoid.independent:.2g} % of them as independent, from how successive residuals resemble each other. An ellipsoid "
+        f"fixes the matrix up to a rotation, which {gravity}.</p>"
     )
     return section
 
