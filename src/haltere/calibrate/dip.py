@@ -20,6 +20,8 @@ PRIOR = math.radians(2.0)
 #: 1 sigma of the dip of the World Magnetic Model at a place [rad]: 0.2 deg of the model, the rest local.
 DIP_SD = math.radians(0.5)
 FEWEST = 50
+#: Sine of the dip beyond which nothing is made of it (87 deg).
+STEEP = 0.9986
 
 
 @dataclass(frozen=True)
@@ -58,7 +60,7 @@ class Turn:
 
 
 def turn(ellipsoid: Ellipsoid, m: FloatArray, down: FloatArray, u: FloatArray | None = None, dip: float | None = None) -> Turn | None:
-    """Find the rotation R that makes ``down · R y = sin(dip)`` hold best, y the unit vectors on the sphere.
+    """Find the rotation R that makes ``asin(down · R y) = dip`` hold best, y the unit vectors on the sphere.
 
     Parameters
     ----------
@@ -92,35 +94,40 @@ def turn(ellipsoid: Ellipsoid, m: FloatArray, down: FloatArray, u: FloatArray | 
     n = np.linalg.norm(y, axis=1)
     y = y / n[:, None]
     sine = np.clip(np.sum(g * y, axis=1), -1.0, 1.0)
-    s = math.sin(dip) if dip is not None else float(np.median(sine))
     R = np.eye(3)
-    prior = np.diag([PRIOR**-2] * 3 + [0.0 if dip is None else (math.cos(dip) * DIP_SD) ** -2])
-    first = np.array([0.0, 0.0, 0.0, s])
+    prior = np.diag([PRIOR**-2] * 3 + [0.0 if dip is None else DIP_SD**-2])
+    first = np.array([0.0, 0.0, 0.0, dip if dip is not None else float(np.median(np.arcsin(sine)))])
     x = first.copy()
     w = np.ones(len(m))
     sigma = independent = 1.0
+    cosine = np.ones(len(m))
     N = prior
     J = np.empty((len(m), 4))
     for _ in range(20):
         R = Rotation.from_rotvec(x[:3]).as_matrix()
         z = y @ R.T
-        r = np.sum(g * z, axis=1) - x[3]
+        sine_z = np.clip(np.sum(g * z, axis=1), -STEEP, STEEP)
+        cosine = np.sqrt(1.0 - sine_z * sine_z)
+        # an angle: the sine would find a steep field better than a flat one, whatever the data
+        r = np.arcsin(sine_z) - x[3]
         middle = float(np.median(r))
         sigma = max(1.4826 * float(np.median(np.abs(r - middle))), 1e-6)
         w = np.minimum(1.0, 2.5 / np.maximum(np.abs(r - middle) / sigma, 1e-12))  # Huber
         sigma = max(math.sqrt(float(w @ (r * r)) / float(np.sum(w))), 1e-6)
         independent = 1.0 / correlation_time(r)
-        J = np.column_stack([np.cross(z, g), -np.ones(len(z))])  # by a small rotation on the left, and by sin(dip)
+        J = np.column_stack([np.cross(z, g) / cosine[:, None], -np.ones(len(z))])  # by a small rotation on the left, and by the dip
         scale = independent / (sigma * sigma)
         N = scale * (J * w[:, None]).T @ J + prior
         step = np.linalg.solve(N, -(scale * J.T @ (w * r) + prior @ (x - first)))
         x[:3] = (Rotation.from_rotvec(step[:3]) * Rotation.from_rotvec(x[:3])).as_rotvec()
-        x[3] = min(max(x[3] + step[3], -0.9999), 0.9999)
+        x[3] += step[3]
         if float(np.max(np.abs(step))) < 1e-9:
             break
     # what the ellipsoid's errors do to it: dx = -N^-1 J^T W ∂r/∂θ dθ
     inverse = np.linalg.inv(N)
-    onto = (g @ R - np.sum((g @ R) * y, axis=1)[:, None] * y) / n[:, None]  # by the vector on the sphere before it has unit length
+    onto = (g @ R - np.sum((g @ R) * y, axis=1)[:, None] * y) / (n * cosine)[
+        :, None
+    ]  # by the vector on the sphere before it has unit length
     d = m - ellipsoid.centre - np.outer(loads, ellipsoid.load)
     by = [-onto @ ellipsoid.shape, np.column_stack([np.sum(onto * (d @ b.T), axis=1) for b in BASIS])]
     if len(ellipsoid.covariance) > 9:
@@ -129,8 +136,7 @@ def turn(ellipsoid: Ellipsoid, m: FloatArray, down: FloatArray, u: FloatArray | 
     P = inverse + K @ ellipsoid.covariance @ K.T
     after = np.sum(g * (y @ R.T), axis=1)
     return Turn(
-        x[:3], P[:3, :3], K[:3] @ ellipsoid.covariance, math.asin(x[3]), math.sqrt(P[3, 3]) / max(math.sqrt(1.0 - x[3] ** 2), 1e-3),
-        _scatter(sine), _scatter(after), len(m),
+        x[:3], P[:3, :3], K[:3] @ ellipsoid.covariance, float(x[3]), math.sqrt(P[3, 3]), _scatter(sine), _scatter(after), len(m),
     )  # fmt: skip
 
 

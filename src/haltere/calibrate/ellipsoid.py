@@ -42,7 +42,8 @@ class Ellipsoid:
     load
         Shift of the centre a unit of load (3,); zeros where none was fitted.
     covariance
-        Of ``centre, shape (xx, yy, zz, xy, xz, yz)[, load]``, (9, 9) or (12, 12), from the scatter about the surface.
+        Of ``centre, shape (xx, yy, zz, xy, xz, yz)[, load]``, (9, 9) or (12, 12), from the scatter about the surface and how it
+        correlates in time.
     sigma
         Standard deviation of the vectors about the surface, along its normal [unit].
     weights
@@ -51,6 +52,8 @@ class Ellipsoid:
         Distance of each vector from the surface to first order (n,) [unit].
     independent
         Share of the samples that are independent, from the correlation of successive residuals.
+    stretches
+        Number of stretches of the record that the covariance rests on; the number of samples where they do not correlate.
     """
 
     centre: FloatArray
@@ -61,6 +64,7 @@ class Ellipsoid:
     weights: FloatArray
     residuals: FloatArray
     independent: float
+    stretches: float
 
     def __call__(self, m: FloatArray, u: FloatArray | float = 0.0) -> FloatArray:
         """Vectors (n, 3) on the unit sphere, at loads (n,)."""
@@ -119,11 +123,15 @@ def fit(m: FloatArray, method: str = "sampson", load: FloatArray | None = None, 
     p, w = _solve(x, method if load is None else "sampson", u, robust)
     r, J = _residuals(p, x, u)
     sigma = _scale(r, w, len(p)) if robust else math.sqrt(float(r @ r) / (len(r) - len(p)))
-    independent = 1.0 / correlation_time(r * w)
+    scores = J * (w * r)[:, None]
     information = (J * w[:, None]).T @ J
     if np.linalg.cond(information) > 1e16:
         raise _flat()
-    cov = np.linalg.inv(information) * sigma * sigma / independent
+    inverse = np.linalg.inv(information)
+    time = correlation_time(r * w)
+    spectral, stretches = _spectral(scores, information * sigma * sigma, time)
+    cov = inverse @ spectral @ inverse
+    independent = 1.0 / time
     # from scaled to given units: centre = middle + size p, shape = p / size, and the centre is moved to load zero
     T = np.zeros((len(p), len(p)))
     T[:3, :3] = size * np.eye(3)
@@ -134,7 +142,7 @@ def fit(m: FloatArray, method: str = "sampson", load: FloatArray | None = None, 
         T[:3, 9:] = -low * size / unit * np.eye(3)
         shift = p[9:] * size / unit
     return Ellipsoid(
-        middle + size * p[:3] - low * shift, _matrix(p[3:9]) / size, shift, T @ cov @ T.T, sigma * size, w, r * size, independent
+        middle + size * p[:3] - low * shift, _matrix(p[3:9]) / size, shift, T @ cov @ T.T, sigma * size, w, r * size, independent, stretches
     )
 
 
@@ -324,6 +332,35 @@ def _consistency() -> float:
 def _scale(r: FloatArray, w: FloatArray, parameters: int) -> float:
     total = float(np.sum(w))
     return math.sqrt(float(w @ (r * r)) / max(total - parameters, 1.0) / _consistency())
+
+
+def _spectral(scores: FloatArray, white: FloatArray, time: float) -> tuple[FloatArray, float]:
+    """Covariance (p, p) of the sum of the scores (n, p) that correlate in time, and the number of stretches that it is from.
+
+    It is never below ``white``, which takes them for independent.
+
+    From the sums over stretches that overlap (Newey and West, 1987): what residuals have in common over time counts only as far as
+    their derivatives have it in common too. Stretches are four correlation times long, and a tenth of the record at most.
+    """
+    n = len(scores)
+    length = int(min(max(4.0 * time, 1.0), max(n / 10.0, 1.0)))
+    if time < 1.5 or length < 2:
+        return white, float(n)
+    total = np.concatenate([np.zeros((1, scores.shape[1])), np.cumsum(scores, axis=0)])
+    sums = total[length:] - total[:-length]
+    # what the finite stretch misses, what a record of few correlation times cannot show, and what the fitted parameters take off
+    missed = (1.0 + time / length) * max(1.0, 4.0 * time / length) * (1.0 + scores.shape[1] * length / n)
+    S = sums.T @ sums / length * missed
+    values, vectors = np.linalg.eigh(_whitened(S, white))
+    L = np.linalg.cholesky(white)
+    return np.asarray(L @ (vectors * np.maximum(values, 1.0)) @ vectors.T @ L.T), n / length
+
+
+def _whitened(S: FloatArray, white: FloatArray) -> FloatArray:
+    """L^-1 S L^-T with white = L L^T."""
+    L = np.linalg.cholesky(white)
+    half = np.linalg.solve(L, S)
+    return np.asarray(np.linalg.solve(L, half.T))
 
 
 def correlation_time(r: FloatArray) -> float:

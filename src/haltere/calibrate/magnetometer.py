@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.stats import chi2
+from scipy.stats import f as f_distribution
 
 from haltere.calibrate.coverage import HEADINGS, Coverage, coverage, heading_errors, heading_sd, level_fields
 from haltere.calibrate.dip import Turn, turn
@@ -257,7 +257,7 @@ def calibrate_magnetometer(
     )  # fmt: skip
     if poor:
         raise CoverageError(
-            "a sensor turned through enough directions", poor, f"{flight.meta.name or 'flight'}, {stream}", _advice(seen), out, raw
+            "a calibration that headings can be taken from", poor, f"{flight.meta.name or 'flight'}, {stream}", _advice(seen, out), out, raw
         )
     return out
 
@@ -323,12 +323,14 @@ def _load(flight: FlightLog, wanted: str, t: FloatArray, notes: list[str]) -> tu
 
 
 def _real(e: Ellipsoid, u: FloatArray, word: str, notes: list[str]) -> bool:
-    """Whether a load's field is more than chance."""
+    """Whether a load's field is more than chance: Hotelling's T² with as many observations as the covariance has stretches."""
     statistic = float(e.load @ np.linalg.solve(e.covariance[9:, 9:], e.load))
-    real = statistic > float(chi2.ppf(1.0 - LOAD_CHANCE, 3))
+    n = max(e.stretches, 5.0)
+    chance = float(f_distribution.sf(statistic * (n - 3.0) / (3.0 * (n - 1.0)), 3, n - 3.0))
+    real = chance < LOAD_CHANCE
     size = float(np.linalg.norm(e.load)) * float(np.ptp(np.percentile(u, [1.0, 99.0])))
-    what = f"the field that follows {word}: {size:.2g} uT over the flight, chi-square {statistic:.1f} of 3"
-    notes.append(f"{what}, taken" if real else f"{what}, which may be chance, not taken")
+    what = f"the field that follows {word}, {size:.2g} uT over the flight, is chance with probability {chance:.2g}"
+    notes.append(f"{what}: taken" if real else f"{what}: not taken")
     return real
 
 
@@ -414,8 +416,12 @@ def _judge(seen: Coverage, sd: FloatArray, sigma: float, notes: list[str]) -> st
     return ""
 
 
-def _advice(seen: Coverage) -> str:
+def _advice(seen: Coverage, c: MagnetometerCalibration) -> str:
+    """What to do about a refused calibration."""
+    if seen.share > 0.6:
+        spread = 100.0 * c.spread(c.calibrated)
+        return (
+            f"{100.0 * seen.share:.0f} % of the directions were seen, but the strength spreads by {spread:.2g} % still: go away from iron"
+        )
     what = f"; the field never came from near {', '.join(seen.missing)} in the sensor's axes" if seen.missing else ""
-    return (
-        f"{100.0 * seen.share:.0f} % of the directions were seen{what}: roll and pitch further, or rotate it by hand through all attitudes"
-    )
+    return f"{100.0 * seen.share:.0f} % of the directions were seen{what}: roll and pitch further, or turn it by hand through all attitudes"
