@@ -125,9 +125,7 @@ def turn(ellipsoid: Ellipsoid, m: FloatArray, down: FloatArray, u: FloatArray | 
             break
     # what the ellipsoid's errors do to it: dx = -N^-1 J^T W ∂r/∂θ dθ
     inverse = np.linalg.inv(N)
-    onto = (g @ R - np.sum((g @ R) * y, axis=1)[:, None] * y) / (n * cosine)[
-        :, None
-    ]  # by the vector on the sphere before it has unit length
+    onto = (g @ R - np.sum((g @ R) * y, axis=1)[:, None] * y) / (n * cosine)[:, None]  # by y before it has unit length
     d = m - ellipsoid.centre - np.outer(loads, ellipsoid.load)
     by = [-onto @ ellipsoid.shape, np.column_stack([np.sum(onto * (d @ b.T), axis=1) for b in BASIS])]
     if len(ellipsoid.covariance) > 9:

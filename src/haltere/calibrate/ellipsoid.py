@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import contextlib
 import math
 from dataclasses import dataclass
 from functools import lru_cache
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,8 +26,10 @@ SYMMETRIC = ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))
 BASIS = np.array([[[float({i, j} == {r, c} and (i == j) == (r == c)) for c in range(3)] for r in range(3)] for i, j in SYMMETRIC])
 #: Residuals in standard deviations where a weight begins to fall, and from where it is zero (IGG-III, theory-amendments.md §7).
 WEIGHT_FROM, WEIGHT_TO = 2.5, 6.0
-#: Random subsets tried for a start that outliers do not spoil, and vectors in each.
-SUBSETS, SUBSET = 60, 24
+#: Random subsets tried for a sphere that outliers do not move, and vectors in each.
+SUBSETS, SUBSET = 40, 8
+#: Rounds of weights for which a start is followed, and over about how many vectors.
+ROUNDS, THINNED = 8, 2000
 FEWEST = 30
 
 
@@ -161,7 +165,7 @@ def _solve(x: FloatArray, method: str, u: FloatArray, robust: bool) -> tuple[Flo
     """Parameters and weights of centred and scaled vectors: start, then weights and solution in turn until they stay."""
     algebraic = "lg" if method == "sampson" else method
     w = np.ones(len(x))
-    p = _start(x, algebraic, robust)
+    p = _start(x, algebraic, robust, method == "sampson")
     p = np.concatenate([p, np.zeros(3 if len(u) else 0)])
     if robust:
         w = _weights(_residuals(p, x, u)[0])
@@ -178,28 +182,51 @@ def _solve(x: FloatArray, method: str, u: FloatArray, robust: bool) -> tuple[Flo
     return p, w
 
 
-def _start(x: FloatArray, method: str, robust: bool) -> FloatArray:
-    """The algebraic fit of all vectors, or of the random subset whose ellipsoid lies nearest to half of them."""
-    tried = [np.ones(len(x))]
-    if robust:
-        rng = np.random.default_rng(len(x))  # the same log gives the same result
-        for _ in range(SUBSETS):
-            w = np.zeros(len(x))
-            w[rng.choice(len(x), min(SUBSET, len(x)), replace=False)] = 1.0
-            tried.append(w)
-    best, least = None, math.inf
-    for w in tried:
-        try:
-            p = _algebraic(x, w, method)
-        except HaltereError:
-            continue
-        middle = float(np.median(np.abs(_distances(p, x))))
-        # a subset has to be clearly better: where there are no outliers all vectors together know more
-        if middle < (least if best is None or w is tried[0] else 0.7 * least):
-            best, least = p, middle
-    if best is None:
+def _start(x: FloatArray, method: str, robust: bool, refine: bool) -> FloatArray:
+    """The algebraic fit of all vectors, or of those near a sphere that outliers do not move, whichever ends nearer to most of them.
+
+    A sphere has four parameters, which a few vectors fix even where directions are missing; distortions are small beside it, outliers
+    are not. Ellipsoids through few vectors are no start: where directions are missing they are wild.
+    """
+    if not robust:
+        return _algebraic(x, np.ones(len(x)), method)
+    x = x[:: max(1, len(x) // THINNED)]
+    followed = []
+    for w in (np.ones(len(x)), _near_sphere(x)):
+        with contextlib.suppress(HaltereError):
+            followed.append(_algebraic(x, w, method))
+            if refine:
+                followed.append(_gauss_newton(followed[-1], x, np.zeros(0), w))
+    if not followed:
         raise _flat()
-    return best
+    for _ in range(ROUNDS):
+        for k, p in enumerate(followed):
+            w = _weights(_distances(p, x))
+            with contextlib.suppress(HaltereError):
+                followed[k] = _gauss_newton(p, x, np.zeros(0), w, 15) if refine else _algebraic(x, w, method)
+    distances = [np.abs(_distances(p, x)) for p in followed]
+    scale = max(1.4826 * min(float(np.median(d)) for d in distances), 1e-14)
+    return followed[int(np.argmin([np.sum(np.minimum(d / scale, WEIGHT_TO) ** 2) for d in distances]))]
+
+
+def _near_sphere(x: FloatArray) -> FloatArray:
+    """Weight one for the vectors (n, 3) near the sphere that most of them are near to, zero for others."""
+    rng = np.random.default_rng(len(x))  # the same log gives the same result
+    D = np.column_stack([2.0 * x, np.ones(len(x))])
+    squares = np.sum(x * x, axis=1)
+    least, r = math.inf, np.zeros(len(x))
+
+    def distances(rows: NDArray[Any]) -> FloatArray:
+        a = np.linalg.lstsq(D[rows], squares[rows], rcond=None)[0]
+        return np.asarray(np.linalg.norm(x - a[:3], axis=1) - math.sqrt(max(float(a[3] + a[:3] @ a[:3]), 0.0)))
+
+    for _ in range(SUBSETS):
+        found = distances(rng.choice(len(x), SUBSET, replace=False))
+        for _ in range(2):
+            found = distances(np.flatnonzero(np.abs(found) <= np.median(np.abs(found))))
+        if (middle := float(np.median(np.abs(found)))) < least:
+            least, r = middle, found
+    return np.asarray(np.abs(r) <= WEIGHT_TO * 1.4826 * least + 1e-12, dtype=np.float64)
 
 
 def _constraint(method: str) -> FloatArray:
@@ -288,12 +315,12 @@ def _residuals(p: FloatArray, x: FloatArray, u: FloatArray) -> tuple[FloatArray,
     return r, np.column_stack([*centre, *shape, *loads])
 
 
-def _gauss_newton(p: FloatArray, x: FloatArray, u: FloatArray, w: FloatArray) -> FloatArray:
+def _gauss_newton(p: FloatArray, x: FloatArray, u: FloatArray, w: FloatArray, most: int = 100) -> FloatArray:
     """Least weighted Sampson distance, with Levenberg's damping."""
     damping = 1e-6
     r, J = _residuals(p, x, u)
     cost = float(w @ (r * r))
-    for _ in range(100):
+    for _ in range(most):
         N, g = (J * w[:, None]).T @ J, J.T @ (w * r)
         step = np.linalg.lstsq(N + damping * np.diag(np.diag(N)), -g, rcond=None)[0]
         trial = p + step

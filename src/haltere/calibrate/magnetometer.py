@@ -420,8 +420,6 @@ def _advice(seen: Coverage, c: MagnetometerCalibration) -> str:
     """What to do about a refused calibration."""
     if seen.share > 0.6:
         spread = 100.0 * c.spread(c.calibrated)
-        return (
-            f"{100.0 * seen.share:.0f} % of the directions were seen, but the strength spreads by {spread:.2g} % still: go away from iron"
-        )
+        return f"{100.0 * seen.share:.0f} % of the directions were seen, but the strength spreads by {spread:.2g} % still: avoid iron"
     what = f"; the field never came from near {', '.join(seen.missing)} in the sensor's axes" if seen.missing else ""
     return f"{100.0 * seen.share:.0f} % of the directions were seen{what}: roll and pitch further, or turn it by hand through all attitudes"
