@@ -66,6 +66,7 @@ from typing import TYPE_CHECKING, Any
 from haltere._version import __version__
 
 if TYPE_CHECKING:
+    from haltere.calibrate.magnetometer import calibrate_magnetometer
     from haltere.drive import run
     from haltere.errors import HaltereError
     from haltere.estimators.base import Estimator
@@ -77,8 +78,8 @@ if TYPE_CHECKING:
     from haltere.simulate import Scenario, inject, simulate
 
 __all__ = [
-    "Estimator", "FlightLog", "FlightMeta", "HaltereError", "Home", "Scenario", "Solution", "Stream", "__version__", "campaign", "compare",
-    "inject", "read", "run", "simulate",
+    "Estimator", "FlightLog", "FlightMeta", "HaltereError", "Home", "Scenario", "Solution", "Stream", "__version__",
+    "calibrate_magnetometer", "campaign", "compare", "inject", "read", "run", "simulate",
 ]  # fmt: skip
 
 # Where each public name lives: loaded at its first use, so that `import haltere` costs no numba, polars or scipy.
@@ -91,6 +92,7 @@ _HOME = {
     "Scenario": "haltere.simulate",
     "Solution": "haltere.flight.solution",
     "Stream": "haltere.flight.log",
+    "calibrate_magnetometer": "haltere.calibrate.magnetometer",
     "campaign": "haltere.evaluate.campaign",
     "compare": "haltere.evaluate.compare",
     "inject": "haltere.simulate",

@@ -158,6 +158,44 @@ def _compare(
     compare(log, estimators=estimators, peers=peers, against=against, assignments=set_ or [], settle=settle, out=out, json=json, show=open_)
 
 
+calibrate = typer.Typer(no_args_is_help=True, rich_markup_mode=None, help="Calibrate a sensor from a log that turns it.")
+app.add_typer(calibrate, name="calibrate", short_help="Calibrate a magnetometer from a log.")
+
+
+@calibrate.command(
+    "magnetometer",
+    short_help="Offset, matrix, load, rotation.",
+    help="Fit offset, matrix, field of the motors and rotation against the IMU of a magnetometer, from a flight or turning it by hand; "
+    "write parameters for haltere, PX4 and ArduPilot with their uncertainty, and a page. Refused where too few directions were seen.",
+)
+def _calibrate_magnetometer(
+    log: Log,
+    method: Annotated[str, typer.Option("--method", metavar="M", help="sampson, lg, fz or axis.")] = "sampson",
+    load: Annotated[str, typer.Option("--load", metavar="L", help="auto, off, current, throttle or rotors.")] = "auto",
+    stream: Annotated[str, typer.Option("--stream", metavar="S", help="Which unit, such as magnetometer.1.")] = "magnetometer",
+    config: Annotated[
+        Path | None, typer.Option("--config", metavar="F", help="Configuration file: units, axes, home, field.", show_default=False)
+    ] = None,
+    set_: Annotated[
+        list[str] | None,
+        typer.Option("--set", metavar="KEY=VALUE", help="One key, e.g. field.strength=48. May be repeated.", show_default=False),
+    ] = None,
+    out: Annotated[
+        Path | None, typer.Option("--out", metavar="DIR", help="Folder to write. Default: ./<log>.haltere", show_default=False)
+    ] = None,
+    columns: Columns = None,
+    column: Column = None,
+    json: Json = False,
+    open_: Open = False,
+) -> None:
+    from haltere.cli.calibrate import magnetometer
+
+    magnetometer(
+        log, method=method, load=load, stream=stream, config=config, assignments=set_ or [], out=out, columns=columns, column=column,
+        json=json, show=open_,
+    )  # fmt: skip
+
+
 @app.command(
     "simulate",
     short_help="A simulated flight with truth.",

@@ -18,6 +18,7 @@ from haltere.estimators import step as kernels
 from haltere.estimators.inputs import altitude_of, parameters
 from haltere.flight import config as configuration
 from haltere.flight.config import Config
+from haltere.flight.corrections import calibrated, calibration
 from haltere.flight.door import impossible_place, impossible_pressure
 from haltere.flight.names import nearest_column, nearest_stream
 from haltere.flight.schema import column as schema_column
@@ -179,6 +180,11 @@ class Estimator:
     initial
         State to begin from instead of aligning.
 
+    Raises
+    ------
+    UsageError
+        A configuration of another estimator, or one with a magnetometer's load, which is not known online.
+
     Examples
     --------
     >>> est = Estimator("ahrs")
@@ -195,6 +201,12 @@ class Estimator:
             self.config = config
         else:
             self.config = configuration.resolve(name, "default", config or {}, "Estimator")
+        if self.config["magnetometer.load"] != "off":
+            raise UsageError(
+                "magnetometer.load off", repr(self.config["magnetometer.load"]), "Estimator",
+                "online the load is not known: take its field off before offering, and set magnetometer.load=off",
+            )  # fmt: skip
+        self._calibration = calibration(self.config.values)
         self._S = new_state(self.config, initial)
         self._prm = parameters(self.config)
         self._aids = as_records(np.empty(4096, AID_RECORD))
@@ -239,7 +251,8 @@ class Estimator:
             Time stamp [s]; it was valid at t minus the configured delay.
         values
             By column name as in the flight folder, or in order: gnss ``lat, lon, alt[, vel_n, vel_e, vel_d]`` (deg, m, m/s),
-            barometer ``pressure`` [Pa], magnetometer ``mag_x, mag_y, mag_z`` [uT], power ``current`` [A].
+            barometer ``pressure`` [Pa], magnetometer ``mag_x, mag_y, mag_z`` [uT], to which a calibration (``magnetometer.*``) is applied,
+            power ``current`` [A].
         variances
             Of the values in order, for gnss (lat, lon and alt in m^2); NaN, not positive or absent: as configured.
 
@@ -281,6 +294,9 @@ class Estimator:
             return self._refuse(sensor, "not finite")
         if m == (0.0, 0.0, 0.0):
             return self._refuse(sensor, "zero")
+        if self._calibration is not None:
+            x, y, z = calibrated(np.array([m[:3]]), self._calibration)[0].tolist()
+            return self._queue(MAGNETOMETER, t, (x, y, z), _NAN)
         return self._queue(MAGNETOMETER, t, (m[0], m[1], m[2]), _NAN)
 
     def _offer_gnss(self, t: float, values: Sequence[float] | Mapping[str, float], variances: Sequence[float] | None) -> bool:

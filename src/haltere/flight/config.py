@@ -74,6 +74,11 @@ def _axes(doc: str) -> Key:
     return Key(axes.WORDS[0], "one each of F or B, R or L, D or U", doc, words=axes.WORDS)
 
 
+_CALIBRATION = (
+    "m = A (m_raw - b - k load), in the sensor's axes, after unit and axes were put right. m_raw is the field before the autopilot's own "
+    "correction where the log tells it. `haltere calibrate magnetometer` finds it."
+)
+
 #: Every key (theory-amendments.md §8 unless said). NaN: from the data.
 KEYS: dict[str, Key] = {
     "noise.gyro": _positive(1.5e-3, "rad/s/sqrt(Hz)", "Gyro white noise density, vibration included. Higher trusts the aids more."),
@@ -230,6 +235,16 @@ KEYS: dict[str, Key] = {
         "The same for the accelerometer. `BLU`, all three turned over, is one that gives gravity instead of specific force."
     ),
     "axes.magnetometer": _axes("The same for the magnetometer."),
+    "magnetometer.offset_x": Key(0.0, "uT", f"Offset b of the magnetometer: {_CALIBRATION}"),
+    "magnetometer.offset_y": Key(0.0, "uT", "The same along y."),
+    "magnetometer.offset_z": Key(0.0, "uT", "The same along z."),
+    **{f"magnetometer.matrix_{r}{c}": Key(float(r == c), "1", f"Matrix A of the same, {r} from {c}.") for r in "xyz" for c in "xyz"},
+    "magnetometer.load": _switch(
+        "off",
+        "What the magnetometer's offset follows: the battery's current, the mean rotor command, or the mean rotor speed.",
+        ("off", "current", "throttle", "rotors"),
+    ),
+    **{f"magnetometer.load_{a}": Key(0.0, "uT/A, uT or uT s/rad", f"Field k a unit of that load, along {a}.") for a in "xyz"},
 }
 
 #: Keys that stand for several, each with what it sets.

@@ -29,7 +29,7 @@ __all__ = ["csv_table", "parquet_table", "read", "read_folder", "sniff", "to_col
 TOML = "flight.toml"
 KEYS = (
     *("name", "source", "start_utc", "time_offset", "frame", "imu_kind", "streams", "notes"),
-    *("home", "vehicle", "delays", "mounting", "noise", "field", "text", "discarded", "fault"),
+    *("home", "vehicle", "delays", "mounting", "noise", "field", "text", "discarded", "fault", "compass"),
 )
 FRAMES = ("NED/FRD", "ENU/FLU")
 #: Tables of a result folder, which are no streams.
@@ -175,6 +175,7 @@ def _to_toml(flight: FlightLog) -> str:
         "text": {k: v for k, v in text.items() if v} or None,
         "discarded": flight.discarded or None,
         "fault": meta.faults or None,
+        "compass": {k: v for k, v in meta.compass.items() if v} or None,
     }
     return tomli_w.dumps(_plain(doc))
 
@@ -311,6 +312,7 @@ def _meta(doc: Mapping[str, Any], file: Path) -> FlightMeta:
         field=field,
         imu_kind=_choice(doc, "imu_kind", IMU_KINDS, file),
         faults=faults,
+        compass={name: dict(_table(_table(doc, "compass", file), name, file)) for name in _table(doc, "compass", file)},
     )
 
 
@@ -480,7 +482,7 @@ def _to_ned_frd(flight: FlightLog) -> FlightLog:
     streams = {}
     for name, stream in flight.streams.items():
         columns = dict(stream.columns)
-        for stem in ("gyro", "accel", "mag", "gyro_bias", "accel_bias"):
+        for stem in ("gyro", "accel", "mag", "raw", "gyro_bias", "accel_bias"):
             for axis in "yz":
                 if (key := f"{stem}_{axis}") in columns:
                     columns[key] = -columns[key]

@@ -175,6 +175,9 @@ class FlightMeta:
         ``instant``: a sample is the value at its time; ``mean``: the mean since the sample before.
     faults
         What was injected. No estimator reads it.
+    compass
+        What a magnetometer stream is to its autopilot, for parameters to paste: ``autopilot`` (PX4, ArduPilot), ``slot`` (number of its
+        parameters), ``rotation`` (q_b_sensor of the parameters' axes), ``device``.
     """
 
     name: str = ""
@@ -189,6 +192,7 @@ class FlightMeta:
     field: dict[str, float] = dataclass_field(default_factory=dict)
     imu_kind: str = "instant"
     faults: list[dict[str, Any]] = dataclass_field(default_factory=list)
+    compass: dict[str, dict[str, Any]] = dataclass_field(default_factory=dict)
 
 
 class FlightLog:

@@ -91,7 +91,7 @@ STREAMS: dict[str, StreamSchema] = {
         StreamSchema(
             "magnetometer",
             "magnetic field",
-            (T, *_xyz("mag", "uT", "FRD", "magnetic field")),
+            (T, *_xyz("mag", "uT", "FRD", "magnetic field"), *_xyz("raw", "uT", "FRD", "magnetic field before the autopilot's correction")),
             ("t", "mag_x", "mag_y", "mag_z"),
         ),
         StreamSchema(

@@ -5,7 +5,17 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["angles_between", "conjugate", "euler", "euler_between", "heading_between", "multiply", "rotation_vector", "slerp", "tilt_between"]
+__all__ = [
+    "angles_between",
+    "conjugate",
+    "euler",
+    "euler_between",
+    "heading_between",
+    "multiply",
+    "rotation_vector",
+    "slerp",
+    "tilt_between",
+]
 
 FloatArray = NDArray[np.float64]
 

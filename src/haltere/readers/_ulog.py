@@ -99,6 +99,8 @@ class Log:
             builder.note(f"the logger dropped data {len(ulog.dropouts)} times, {total} ms in all")
         changed = {name: value for _, name, value in ulog.changed_parameters}
         self.params: dict[str, int] = {k: v for k, v in (ulog.initial_parameters | changed).items() if isinstance(v, int)}
+        #: All of them as numbers.
+        self.numbers = {k: float(v) for k, v in (ulog.initial_parameters | changed).items() if isinstance(v, int | float)}
         known = isinstance(ulog.msg_info_dict.get("ver_sw_release", 0), int)
         self.version: str | None = ulog.get_version_info_str() if known else None
         self._topics: dict[str, dict[int, Topic]] = {}

@@ -10,6 +10,7 @@ import numpy as np
 
 from haltere.readers._ardupilot_solution import add_solution, add_truth, primary
 from haltere.readers._common import RPM, Builder, Columns, FloatArray, IntArray
+from haltere.readers._compass import ardupilot_compass
 from haltere.readers._dataflash import BINARY_HEAD, DataFlash, Messages, is_text_log
 from haltere.readers._modes import ARDUPILOT_MODES, add_modes, ardupilot_mode, spelt
 
@@ -141,13 +142,16 @@ def _add_magnetometer(log: DataFlash, builder: Builder, params: dict[str, float]
         columns = {f"mag_{a}": unit.get(f"Mag{a.upper()}") * MILLIGAUSS for a in "xyz"}
         # What the autopilot added, so that the raw field can be had back.
         columns |= {f"offset_{a}": unit.get(f"Ofs{a.upper()}") * MILLIGAUSS for a in "xyz"}
-        builder.add(_name("magnetometer", i), log.us(unit), columns)
+        raw, builder.meta.compass[_name("magnetometer", i)], note = ardupilot_compass(unit, number, params)
+        builder.add(_name("magnetometer", i), log.us(unit), columns | raw)
+        if note:
+            builder.note(note)
         if i == 0 and number:
             builder.note(f"magnetometer is MAG instance {number}: the estimator's primary lane used it")
     if units:
         builder.note(
             "magnetometer is already corrected by the autopilot with its COMPASS_* parameters; "
-            "offset_x, offset_y, offset_z [uT] are the offsets in it"
+            "offset_x, offset_y, offset_z [uT] are the offsets in it, raw_x, raw_y, raw_z [uT] the field before it"
         )
 
 

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from haltere.readers._common import GAUSS, RPM, UTC_FLOOR_US, Builder, Columns, IntArray
+from haltere.readers._compass import px4_compass
 from haltere.readers._modes import add_modes, px4_mode
 from haltere.readers._px4_solution import add_solution, add_truth, set_home
 from haltere.readers._ulog import MAGIC, Log, Topic
@@ -148,15 +149,24 @@ def _add_magnetometer(log: Log, builder: Builder) -> None:
     wanted = naming[0].last("mag_device_id") if naming else None
     units.sort(key=lambda u: (not wanted or u.last("device_id") != wanted, u.instance))
     for name, unit in _numbered("magnetometer", units):
-        builder.add(name, unit.us, unit.vector("magnetometer_ga", "mag", scale=GAUSS))
+        _add_calibrated(log, builder, name, unit, unit.us, unit.vector("magnetometer_ga", "mag", scale=GAUSS))
     combined = log.one("sensor_combined")
     if not units and combined is not None and "magnetometer_timestamp_relative" in combined:
         us, rows = _held(combined, "magnetometer", "magnetometer", builder)
-        builder.add("magnetometer", us, {k: v[rows] for k, v in combined.vector("magnetometer_ga", "mag", scale=GAUSS).items()})
+        mag = {k: v[rows] for k, v in combined.vector("magnetometer_ga", "mag", scale=GAUSS).items()}
+        _add_calibrated(log, builder, "magnetometer", combined, us, mag)
     if not builder.has("magnetometer"):
         for name, unit in _numbered("magnetometer", log.all("sensor_mag")):
             builder.note("magnetometer is sensor_mag: raw, without the calibration that the autopilot applied")
             builder.add(name, unit.us, {f"mag_{a}": unit.get(a, scale=GAUSS) for a in "xyz"})
+
+
+def _add_calibrated(log: Log, builder: Builder, name: str, unit: Topic, us: IntArray, mag: Columns) -> None:
+    """A magnetometer with the field before the autopilot's calibration beside it, where the parameters tell it."""
+    raw, builder.meta.compass[name], note = px4_compass(log, unit, us, mag)
+    builder.add(name, us, mag | raw)
+    if note:
+        builder.note(note)
 
 
 def _add_barometer(log: Log, builder: Builder) -> None:

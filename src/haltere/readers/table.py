@@ -20,9 +20,11 @@ from haltere.readers._common import FloatArray, unusable
 if TYPE_CHECKING:
     import polars as pl
 
-__all__ = ["UNITS", "read", "sniff"]
+__all__ = ["ROWS", "UNITS", "bare_vectors", "read", "sniff"]
 
 PARQUET = b"PAR1"
+#: What is said of a table without time.
+ROWS = "the table has no time: t is the number of the row"
 #: Streams whose columns are recognised without the stream's name.
 BARE_STREAMS = tuple(name for name in STREAMS if name not in ("onboard", "truth"))
 EXAMPLE = 'e.g. {"imu.t": "time_us [us]", "imu.gyro_x": "gx [deg/s]", "imu.accel_x": "ax [g]"}'
@@ -55,6 +57,8 @@ def read(path: Path, column_map: Mapping[str, str] | None = None) -> FlightLog:
     column_map
         Which column is what: ``{"imu.gyro_x": "gx [deg/s]"}`` takes the column ``gx`` in deg/s for ``gyro_x`` of the stream ``imu``.
         Without a unit the schema's is meant; ``-gx`` turns the sign; ``{"t": "time [ms]"}`` is the time of every stream without its own.
+        In a table of numbers without a header line ``#1`` is the first column, and ``#row`` the number of the row, for a table without
+        time: ``{"t": "#row [ms]"}``.
         Without a map, columns named ``imu.gyro_x`` or ``gyro_x``, with or without a unit in brackets, are taken.
 
     Returns
@@ -68,11 +72,14 @@ def read(path: Path, column_map: Mapping[str, str] | None = None) -> FlightLog:
     HaltereError
         An unreadable table, a source column that is not there, an unknown stream, column or unit, or a stream without time.
     """
-    table = _load(path)
+    numbered = column_map is not None and any(_split_unit(v)[0].lstrip("-").startswith("#") for v in column_map.values())
+    table = _load_numbers(path) if numbered else _load(path)
     notes: list[str] = []
     wanted = _from_map(column_map, table, path) if column_map is not None else _from_names(table, path, notes)
     discarded: dict[str, dict[str, int]] = {}
     streams: dict[str, dict[str, FloatArray]] = {}
+    if any(columns["t"][0] == "#row" for columns in wanted.values()):
+        notes.append(ROWS)
     for stream, columns in wanted.items():
         values = {name: _values(table, source, unit, column_unit(stream, name), path) for name, (source, unit) in columns.items()}
         t = values.pop("t")
@@ -128,6 +135,46 @@ def _load(path: Path) -> pl.DataFrame:
         name, n = Counter(names).most_common(1)[0]
         raise unusable(path, "columns with names of their own", f"{n} columns {name!r}", "rename one of them")
     return table.rename(dict(zip(table.columns, names, strict=True)))
+
+
+def bare_vectors(path: Path) -> bool:
+    """Whether a file is text of three numbers a line and no header."""
+    try:
+        with path.open("rb") as file:
+            head = file.read(4096)
+        lines = [line for line in head.decode("ascii").splitlines() if line.strip() and not line.startswith("#")]
+        rows = [[float(v) for v in _fields(line)] for line in (lines[:-1] if len(head) == 4096 else lines)]
+    except (OSError, ValueError):
+        return False
+    return len(rows) > 1 and all(len(row) == 3 for row in rows)
+
+
+def _fields(line: str) -> list[str]:
+    """Fields of a line, between commas, semicolons or blanks."""
+    mark = next((c for c in ",;" if c in line), None)
+    return [v.strip() for v in line.strip().strip(mark or " ").split(mark)]
+
+
+def _load_numbers(path: Path) -> pl.DataFrame:
+    """A table of numbers without a header line: columns ``#1``, ``#2``, ... and ``#row``."""
+    import polars as pl
+
+    rows: list[list[float]] = []
+    for n, line in enumerate(path.read_text(encoding="utf-8-sig", errors="replace").splitlines(), 1):
+        if not line.strip() or line.startswith("#"):
+            continue
+        try:
+            rows.append([float(v or "nan") for v in _fields(line)])
+        except ValueError:
+            raise unusable(
+                path, "numbers alone, as there are columns by number", f"{line[:40]!r} in line {n}", "map columns by name"
+            ) from None
+        if len(rows[-1]) != len(rows[0]):
+            raise unusable(path, f"{len(rows[0])} numbers a line", f"{len(rows[-1])} in line {n}", "clean the table")
+    if not rows:
+        raise unusable(path, "a table with values", "none", "copy the log again")
+    columns = np.array(rows).T
+    return pl.DataFrame({**{f"#{k + 1}": v for k, v in enumerate(columns)}, "#row": np.arange(len(rows), dtype=np.float64)})
 
 
 def _split_unit(text: str) -> tuple[str, str]:

@@ -131,6 +131,10 @@ def _changed(fault: Fault, stream: Stream, new: dict[str, FloatArray]) -> Stream
     same = all(np.array_equal(stream[c], v, equal_nan=True) for c, v in new.items())
     if same:
         raise _refused(fault, "a value that it changes", "none: every sample stays as it was", "look at its size and time")
+    for name, values in list(new.items()):  # the field before the autopilot's correction changes with it
+        raw = name.replace("mag_", "raw_")
+        if name.startswith("mag_") and raw in stream:
+            new[raw] = stream[raw] + (values - stream[name])
     return Stream({**stream.columns, **new})
 
 
