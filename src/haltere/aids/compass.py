@@ -161,6 +161,12 @@ def put_out(s: Any, prm: Any, k: int, cause: Any, value: float, threshold: float
 
 
 @jit
+def allowed(s: Any, prm: Any) -> float:
+    """Turn against the gyro [rad] that is no disturbance: half the 1 sigma of what surroundings do, and a little."""
+    return prm.robust_heading + 0.5 * prm.noise_field / (s.field[2] * math.cos(s.field[1]))
+
+
+@jit
 def compare(s: Any, prm: Any) -> tuple[float, float, int]:
     """Largest ratio of a lag's difference to its bound: the difference and the bound [rad], and how many bins ago the lag begins."""
     c = s.compass
@@ -183,7 +189,7 @@ def compare(s: Any, prm: Any) -> tuple[float, float, int]:
         sd = math.sqrt(2.0 * c.noise / w + prm.noise_gyro * prm.noise_gyro * span + b.bias_var * span * span + wrong * wrong)
         same = now.q[0] * b.q[0] + now.q[1] * b.q[1] + now.q[2] * b.q[2] + now.q[3] * b.q[3]
         turned = 2.0 * math.sqrt(max(0.0, 1.0 - same * same))  # chord of the rotation: how far a fixed error of the field has moved
-        limit = prm.robust_heading + prm.robust_calibration * turned / math.cos(s.field[1]) + SIGMAS * sd
+        limit = allowed(s, prm) + prm.robust_calibration * turned / math.cos(s.field[1]) + SIGMAS * sd
         limit += LATE * max(now.rate, b.rate) * math.tan(abs(s.field[1]))
         if abs(r) > worst * limit:
             worst, difference, bound, begin = abs(r) / limit, r, limit, k
@@ -239,7 +245,7 @@ def close_bin(s: Any, prm: Any) -> None:
 @jit
 def apart(s: Any, prm: Any) -> float:
     """How far the smoothed innovation of a sound compass may be off [rad]: what its calibration may do, and the yaw's own uncertainty."""
-    return prm.robust_heading + prm.robust_calibration / math.cos(s.field[1]) + SIGMAS * yaw_sd(s)
+    return allowed(s, prm) + prm.robust_calibration / math.cos(s.field[1]) + SIGMAS * yaw_sd(s)
 
 
 @jit

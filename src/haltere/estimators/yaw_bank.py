@@ -163,8 +163,7 @@ def update(s: Any, z0: float, z1: float, r: float) -> None:
     unknown = yaw2 > SD_UNKNOWN * SD_UNKNOWN
     refused = s.t - s.aid[GNSS_VELOCITY].t_passed > REFUSED
     compass = s.aid[MAGNETOMETER].started == RUNNING and s.t - s.aid[MAGNETOMETER].t_passed < 1.0
-    least = 0.5 * ERROR_MIN if s.compass.out != 0 else ERROR_MIN  # nothing else says anything of yaw while the compass is out
-    contradicted = abs(error) > max(least, 3.0 * sd) and (refused or not compass)
+    contradicted = abs(error) > max(ERROR_MIN, 3.0 * sd) and (refused or not compass)
     if unknown or contradicted:
         reset_yaw(s, error, max(sd, 0.5 * SD_MAX))
         follow(s)

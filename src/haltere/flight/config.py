@@ -147,7 +147,9 @@ KEYS: dict[str, Key] = {
     ),
     "robust.strength": _positive(0.04, "1", "Change of the field's strength taken as 1 sigma: inflated from two on, refused from six on."),
     "robust.dip": _positive(2.5 * DEG, "rad", "The same for its dip."),
-    "robust.heading": _positive(5.0 * DEG, "rad", "Turn against the gyro that a compass is allowed without turning, beside its noise."),
+    "robust.heading": _positive(
+        2.0 * DEG, "rad", "Turn against the gyro that a compass is allowed without turning, beside its noise and half of noise.field."
+    ),
     "robust.calibration": _positive(
         0.12, "1", "Error of its calibration, as a fraction of the field, that may turn a compass when the vehicle turns."
     ),
