@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -101,7 +102,7 @@ class Oracle:
         """From a tape: by row, the state and covariance just before assumptions that tell the past nothing."""
         out = {}
         n = len(self.P[0])
-        for node, after in zip(nodes[:-1], nodes[1:], strict=True):
+        for node, after in pairwise(nodes):
             if after[1] < 0.0:
                 P = np.zeros((n, n))
                 P[np.triu_indices(n)] = node[19 + n - 15 :]
@@ -221,6 +222,26 @@ def test_assumptions_tell_the_past_nothing(monkeypatch: pytest.MonkeyPatch) -> N
     assert (solution["sd_vel_d"] / s["sd_vel_d"]).max() > 1.05  # the barometer does tell the past
 
 
+def _back(
+    F: FloatArray, filtered: list[FloatArray], priors: list[FloatArray], befores: list[FloatArray | None], told: bool
+) -> list[tuple[FloatArray, FloatArray]]:
+    """Smoothed errors and what is stated of them, from those of the filter: after and before fusion, and before one with a mask."""
+    out = [(filtered[-1], filtered[-1] @ filtered[-1].T)]
+    inverse = np.linalg.inv
+    for k in range(len(filtered) - 1, 0, -1):
+        S, Ps = out[-1]
+        plus, before = filtered[k], befores[k]
+        if before is not None and not told:
+            Y = inverse(Ps) - inverse(plus @ plus.T)
+            Pb = inverse(inverse(before @ before.T) + Y)
+            S = before - Pb @ (inverse(Ps) @ (plus - S) + Y @ (before - plus))
+            Ps = Pb
+        P, prior = filtered[k - 1] @ filtered[k - 1].T, priors[k] @ priors[k].T
+        G = np.linalg.solve(prior, F @ P).T
+        out.append((filtered[k - 1] - G @ (priors[k] - S), P + G @ (Ps - prior) @ G.T))
+    return out[::-1]
+
+
 def test_what_is_stated_over_masked_gains_is_true_and_smaller() -> None:
     """The law, in a linear system where every error is a known sum of independent ones: exact covariances, no draws.
 
@@ -253,25 +274,8 @@ def test_what_is_stated_over_masked_gains_is_true_and_smaller() -> None:
             E[:, at + n] -= gain * np.sqrt(r)
             filtered.append(E)
 
-        def back(told: bool) -> list[tuple[FloatArray, FloatArray]]:
-            out = [(filtered[-1], filtered[-1] @ filtered[-1].T)]
-            for k in range(steps - 1, 0, -1):  # noqa: B023
-                S, Ps = out[-1]
-                plus = filtered[k]
-                before = befores[k]
-                if before is not None and not told:
-                    inverse = np.linalg.inv
-                    Y = inverse(Ps) - inverse(plus @ plus.T)
-                    Pb = inverse(inverse(before @ before.T) + Y)
-                    S = before - Pb @ (inverse(Ps) @ (plus - S) + Y @ (before - plus))
-                    Ps = Pb
-                P, prior = filtered[k - 1] @ filtered[k - 1].T, priors[k] @ priors[k].T
-                G = np.linalg.solve(prior, F @ P).T
-                out.append((filtered[k - 1] - G @ (priors[k] - S), P + G @ (Ps - prior) @ G.T))
-            return out[::-1]
-
         for told in (True, False):
-            for (S, Ps), plus in zip(back(told), filtered, strict=True):
+            for (S, Ps), plus in zip(_back(F, filtered, priors, befores, told), filtered, strict=True):
                 P = plus @ plus.T
                 np.testing.assert_allclose(S @ S.T, Ps, atol=1e-7 * np.abs(P).max())
                 excess = np.linalg.eigvalsh(Ps - P).max() / np.abs(P).max()

@@ -140,7 +140,7 @@ def run(
             table = {name: column[keep] for name, column in table.items()}
         solution.smoothed = Solution(table, solution.aids, events, resolved, {}, _covariance(back_cov, back_cov.shape[1]))
         if lost:
-            facts["warnings"].append(f"smoothed: {lost} times the covariance could not be inverted; what is before was smoothed by itself")
+            facts["warnings"].append(f"smoothed: {lost} times what came after could not be used; what is before was smoothed by itself")
     if scored and disturbances(solution.events):
         describe(solution, shown, _unwatched(resolved, initial, t, gyro, accel, offered, solution.t))
     summarise(solution, shown, facts, scored)

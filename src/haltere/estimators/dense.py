@@ -7,7 +7,7 @@ from typing import Any
 from haltere._jit import jit
 from haltere.core.rotation import Mat
 
-__all__ = ["multiply", "solve", "solve_any", "turn_attitude", "turn_block"]
+__all__ = ["multiply", "smaller_than", "solve", "solve_any", "turn_attitude", "turn_block"]
 
 
 @jit
@@ -94,6 +94,24 @@ def solve_any(w: Any) -> bool:
             w.W[i, j] = R[i, m + j]
     for i in range(len(w.mu)):
         w.mu[i] = R[i, 2 * m]
+    return True
+
+
+@jit
+def smaller_than(w: Any, P: Any, Q: Any, by: float) -> bool:
+    """Whether P <= (1 + by) Q: Cholesky's elimination of the difference, in ``w.W``, finds no pivot below zero."""
+    W, m = w.W, w.W.shape[0]
+    for i in range(m):
+        for j in range(m):
+            W[i, j] = (1.0 + by) * Q[i, j] - P[i, j]
+    for k in range(m):
+        if not W[k, k] > 0.0:
+            return False
+        d = 1.0 / W[k, k]
+        for i in range(k + 1, m):
+            f = W[i, k] * d
+            for j in range(k + 1, m):
+                W[i, j] -= f * W[k, j]
     return True
 
 

@@ -110,7 +110,7 @@ def reference_position(reference: Stream, origin: list[float] | None) -> tuple[F
         for axes in ([0, 1], [2]):  # a column comes from one source alone: two would differ by a step
             if np.isfinite(geodetic[:, axes]).any():
                 p[:, axes] = geodetic[:, axes]
-    good = _piece(np.isfinite(p).any(axis=1))
+    good = _piece(np.asarray(np.isfinite(p).any(axis=1)))
     return reference.t[good], p[good]
 
 
