@@ -195,7 +195,7 @@ def test_update_is_the_joint_one(seed: int, memory: float, slow: float) -> None:
     turn = np.eye(15)
     turn[:3, :3] -= 0.5 * np.array([[0.0, -dx[2], dx[1]], [dx[2], 0.0, -dx[0]], [-dx[1], dx[0], 0.0]])
     aids = array(records.AID_RECORD, 8)
-    fusing.fuse_offer(s, aids, 100.0, records.MAGNETOMETER, orthonormal_field.offer(s, prm, m, aids))
+    fusing.fuse_offer(s, aids, 100.0, records.MAGNETOMETER, orthonormal_field.offer(s, s["a"][0], prm, m, aids))
     np.testing.assert_allclose(s["P"], turn @ P @ turn.T, rtol=1e-8, atol=1e-12)
     np.testing.assert_allclose(s["v"] - before["v"], dx[3:6], rtol=1e-8, atol=1e-13)
     np.testing.assert_allclose(rotation_vector(multiply(conjugate(before["q"]), np.array(s["q"]))), dx[:3], rtol=1e-8, atol=1e-13)
@@ -206,7 +206,7 @@ def test_rows_are_derivatives(seed: int) -> None:
     """Against δθ of the main state, central differences; the axes are those of EKF A and do not move with it."""
     s, prm = state(seed), settings(two_stage__memory=0.0, noise__field=0.0)
     m, aids = sample(s, seed), array(records.AID_RECORD, 8)
-    offer = orthonormal_field.offer(s, prm, m, aids)
+    offer = orthonormal_field.offer(s, s["a"][0], prm, m, aids)
     q = np.array(s["q"])
     for k in range(3):
         got = []
@@ -215,7 +215,7 @@ def test_rows_are_derivatives(seed: int) -> None:
             d[k] = sign * 1e-6
             x, y, z, w = (Rotation.from_quat(np.r_[q[1:], q[0]]) * Rotation.from_rotvec(d)).as_quat()
             s["q"][:] = w, x, y, z
-            got.append(np.array(orthonormal_field.offer(s, prm, m, aids)[3]))
+            got.append(np.array(orthonormal_field.offer(s, s["a"][0], prm, m, aids)[3]))
         s["q"][:] = q
         np.testing.assert_allclose((got[0] - got[1]) / 2e-6, [row[0][1][k] for row in offer[5]], atol=1e-9)
 
@@ -226,7 +226,7 @@ def test_the_innovation_test_is_of_the_sample_alone() -> None:
     for memory in (0.0, 2.0, 50.0):
         s, aids = state(3), array(records.AID_RECORD, 8)
         prm = settings(two_stage__memory=memory, noise__magnetometer=0.7, two_stage__robust="off")
-        fusing.fuse_offer(s, aids, 100.0, records.MAGNETOMETER, orthonormal_field.offer(s, prm, sample(s, 3), aids))
+        fusing.fuse_offer(s, aids, 100.0, records.MAGNETOMETER, orthonormal_field.offer(s, s["a"][0], prm, sample(s, 3), aids))
         assert records.COMPONENTS[aids[0]["component"]] == "field_east"
         got.append((float(aids[0]["innovation"]), float(aids[0]["innovation_sd"]), float(aids[0]["test_ratio"])))
         left.append(float(np.trace(np.array(s["P"])[:3, :3])))
@@ -268,7 +268,7 @@ def test_levels(grown: float, status: str) -> None:
     prm = settings(two_stage__tolerance=0.03, two_stage__innovation="off", noise__magnetometer=0.7)
     m = sample(s, 1)
     m["z"][:] *= grown * H_UT / np.linalg.norm(m["z"])
-    fusing.fuse_offer(s, aids, 100.0, records.MAGNETOMETER, orthonormal_field.offer(s, prm, m, aids))
+    fusing.fuse_offer(s, aids, 100.0, records.MAGNETOMETER, orthonormal_field.offer(s, s["a"][0], prm, m, aids))
     assert records.STATUSES[aids[0]["status"]] == status
     s_index = (grown**2 - 1.0) / 0.03
     if status == "deweighted":

@@ -193,9 +193,10 @@ def _loop(
             tapes.append(tape[: int(S["n_nodes"][0])].copy())
             S["n_nodes"] = 0
 
+    stage = kernels.stage_of(S)
     i = j = 0
     while i < len(t) or S["imu_n"][0] > 0:
-        i, j = kernels.run_chunk(S, prm, t, gyro, accel, i, min(i + CHUNK, len(t)), m.kind, m.t, m.z, m.r, j, chunk, cov, aids, tape)
+        i, j = kernels.run_chunk(S, prm, t, gyro, accel, i, min(i + CHUNK, len(t)), m.kind, m.t, m.z, m.r, j, chunk, cov, aids, tape, stage)
         drain()
         if progress is not None:
             progress(i / len(t))

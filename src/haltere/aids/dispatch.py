@@ -40,7 +40,7 @@ N_SENSORS = 9
 
 
 @jit
-def offer_of(s: Any, prm: Any, sensor: int, m: Any, aids: Any, dt: float, w: Vec, resting: bool) -> Offer:
+def offer_of(s: Any, prm: Any, sensor: int, m: Any, aids: Any, dt: float, w: Vec, resting: bool, stage: Any) -> Offer:
     """What a sensor has to say: of the queued measurement ``m``, or of itself where it is a pseudo-sensor."""
     if sensor == GNSS_VELOCITY:
         return gnss.offer_velocity(s, prm, m)
@@ -49,8 +49,8 @@ def offer_of(s: Any, prm: Any, sensor: int, m: Any, aids: Any, dt: float, w: Vec
     if sensor == BAROMETER:
         return barometer.offer(s, prm, m, aids)
     if sensor == MAGNETOMETER:
-        if len(s.a) > 0:
-            return orthonormal_field.offer(s, prm, m, aids)
+        if stage is not None:
+            return orthonormal_field.offer(s, stage[0], prm, m, aids)
         return magnetometer.offer(s, prm, m, aids)
     if sensor == POWER:
         interference.hear(s, m.t, m.z[0])
@@ -87,7 +87,7 @@ def due(s: Any, prm: Any, sensor: int, w: Vec, f: Vec) -> bool:
 
 
 @jit
-def fuse_all(s: Any, prm: Any, aids: Any, dt: float, w: Vec, f: Vec, first: int, end: int) -> None:
+def fuse_all(s: Any, prm: Any, aids: Any, dt: float, w: Vec, f: Vec, first: int, end: int, stage: Any) -> None:
     """Fuse every queued measurement valid at or before the state's time, sensor by sensor, then the pseudo-measurements due.
 
     Only of sensors ``first`` ... ``end`` - 1.
@@ -106,15 +106,14 @@ def fuse_all(s: Any, prm: Any, aids: Any, dt: float, w: Vec, f: Vec, first: int,
             m = s.ring[sensor if sensor < N_QUEUED else 0, i]
             resting = s.rest.still == 1 and s.rest.moved == 0
             d = dcm((s.q[0], s.q[1], s.q[2], s.q[3]))[2]
-            offer = offer_of(s, prm, sensor, m, aids, dt, w, resting)
+            offer = offer_of(s, prm, sensor, m, aids, dt, w, resting, stage)
             yaw, bias = s.yaw_corrected, d[0] * s.bg[0] + d[1] * s.bg[1] + d[2] * s.bg[2]
             fused = s.aid[sensor].n_fused
             fuse_offer(s, aids, t, sensor, offer)
             if sensor == MAGNETOMETER:
                 compass.attribute(s, yaw, bias)
-            if sensor == GNSS_VELOCITY and s.aid[sensor].n_fused > fused:
-                for k in range(len(s.a)):
-                    first_stage.fuse_velocity(s.a[k], prm, m)
+            if stage is not None and sensor == GNSS_VELOCITY and s.aid[sensor].n_fused > fused:
+                first_stage.fuse_velocity(stage[0], prm, m)
         if i < 0 or sensor >= N_QUEUED:  # a queue is emptied before the next sensor
             sensor += 1
     wake = s.aid[N_QUEUED].t_due

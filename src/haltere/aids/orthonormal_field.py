@@ -125,20 +125,20 @@ def index(prm: Any, m: Vec, strength: float) -> float:
 
 
 @jit
-def begin_yaw(s: Any, prm: Any, m: Any, aids: Any, heading: float) -> None:
+def begin_yaw(s: Any, stage: Any, prm: Any, m: Any, aids: Any, heading: float) -> None:
     """Set an unknown yaw from the first field, in both stages."""
     reset_yaw(s, heading, prm.init_yaw_compass)
-    for i in range(len(s.a)):
-        C = dcm((s.a[i].q[0], s.a[i].q[1], s.a[i].q[2], s.a[i].q[3]))
-        mu = mat_vec(C, (m.z[0], m.z[1], m.z[2]))
-        reset_yaw(s.a[i], wrap(s.field[0] - math.atan2(mu[1], mu[0])), prm.init_yaw_compass)
+    mu = mat_vec(dcm((stage.q[0], stage.q[1], stage.q[2], stage.q[3])), (m.z[0], m.z[1], m.z[2]))
+    reset_yaw(stage, wrap(s.field[0] - math.atan2(mu[1], mu[0])), prm.init_yaw_compass)
     event(s, m.t, E_RESET, MAGNETOMETER, heading)
     record(s, aids, m.t, MAGNETOMETER, C_FIELD, heading, 0.0, prm.init_yaw_compass, 0.0, 1.0, FUSED, R_START)
 
 
 @jit
-def offer(s: Any, prm: Any, m: Any, aids: Any) -> Offer:
+def offer(s: Any, stage: Any, prm: Any, m: Any, aids: Any) -> Offer:
     """Magnetometer sample ``m.z`` [uT, body] to EKF B: z = m_⊥, h = C_Bᵀ [cos D, sin D, 0] (41)-(42), R̄ = λ R_⊥ (45).
+
+    ``stage`` is the record of EKF A, whose gravity it is.
 
     The three components are those along EKF A's east, down and north, decorrelated in this order, so that fusing them one after the
     other is the joint update. In λ go the strength (44) and, where ``two_stage.innovation`` is on, sqrt(NIS), as one factor each.
@@ -154,7 +154,6 @@ def offer(s: Any, prm: Any, m: Any, aids: Any) -> Offer:
     mu = mat_vec(C, z)
     if s.has_field == 0:
         learn_field(s, mu, s.field[0])
-    stage = s.a[0]
     g = dcm((stage.q[0], stage.q[1], stage.q[2], stage.q[3]))[2]
     east, north, horizontal = orthonormal(g, z)
     factor, reason = 1.0, R_NONE
@@ -169,7 +168,7 @@ def offer(s: Any, prm: Any, m: Any, aids: Any) -> Offer:
         a.started = RUNNING
         a.t_passed = m.t
         if yaw_variance(s, C) > 0.25:  # above 30 deg linearisation means little: set, do not fuse
-            begin_yaw(s, prm, m, aids, wrap(s.field[0] - math.atan2(mu[1], mu[0])))
+            begin_yaw(s, stage, prm, m, aids, wrap(s.field[0] - math.atan2(mu[1], mu[0])))
             return NOTHING
     white, slow = prm.noise_magnetometer * prm.noise_magnetometer, prm.noise_field * prm.noise_field
     since = max(m.t - s.compass.t_before, 1e-3)

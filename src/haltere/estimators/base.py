@@ -208,6 +208,7 @@ class Estimator:
             )  # fmt: skip
         self._calibration = calibration(self.config.values)
         self._S = new_state(self.config, initial)
+        self._stage = kernels.stage_of(self._S)
         self._prm = parameters(self.config)
         self._aids = as_records(np.empty(4096, AID_RECORD))
         self._now = np.zeros(11)
@@ -236,7 +237,7 @@ class Estimator:
         """
         kernels.step(
             self._S, self._prm, _number(t, "t", "Estimator.step"), _three(gyro, "gyro"), _three(accel, "accel"),
-            _NO_ROWS, _NO_ROWS, self._aids, _NO_ROWS,
+            _NO_ROWS, _NO_ROWS, self._aids, _NO_ROWS, self._stage,
         )  # fmt: skip
         return self._view
 
@@ -370,7 +371,7 @@ class Estimator:
 
     def finish(self) -> State:
         """Move the fusion horizon to the newest IMU sample: the end of a flight."""
-        kernels.flush(self._S, self._prm, _NO_ROWS, _NO_ROWS, self._aids, _NO_ROWS)
+        kernels.flush(self._S, self._prm, _NO_ROWS, _NO_ROWS, self._aids, _NO_ROWS, self._stage)
         return self._view
 
     def records(self) -> NDArray[np.void]:

@@ -40,6 +40,7 @@ __all__ = [
     "offer",
     "row_width",
     "run_chunk",
+    "stage_of",
     "step",
 ]
 
@@ -53,6 +54,11 @@ NODE_STEPS, NODE_SPAN = 64, 0.05
 BEGINS, FOLLOWS, ASSUMED = 1.0, 0.0, -1.0
 #: No sensor measures more [rad/s, m/s^2].
 RATE_MAX, FORCE_MAX = 100.0, 500.0
+
+
+def stage_of(S: Any) -> Any:
+    """The first stage of a one-element array of states, an array of one record in the same memory; None where there is none."""
+    return S["a"][0] if S["a"].shape[1] else None
 
 
 @entry
@@ -190,11 +196,14 @@ def predict_interval(s: Any, prm: Any, w0: Vec, f0: Vec, w1: Vec, f1: Vec, dt: f
 
 
 @jit
-def predict_stages(s: Any, prm: Any, w0: Vec, f0: Vec, w1: Vec, f1: Vec, dt: float) -> None:
-    """Predict the first stage, where there is one, with its own biases beside the main state."""
-    for i in range(len(s.a)):
-        s.a[i].gravity = s.gravity
-        predict_interval(s.a[i], prm, w0, f0, w1, f1, dt)
+def predict_stage(s: Any, stage: Any, prm: Any, w0: Vec, f0: Vec, w1: Vec, f1: Vec, dt: float) -> None:
+    """Predict the first stage, where there is one, with its own biases beside the main state.
+
+    ``stage`` is None or the one-element array ``s.a``, an argument of its own: of what hangs on a None nothing is compiled.
+    """
+    if stage is not None:
+        stage[0].gravity = s.gravity
+        predict_interval(stage[0], prm, w0, f0, w1, f1, dt)
 
 
 @jit
@@ -208,7 +217,7 @@ def bridge_push(s: Any, dt: float) -> None:
 
 
 @jit
-def bridge_gap(s: Any, prm: Any, w0: Vec, f0: Vec, w1: Vec, f1: Vec, dt: float) -> None:
+def bridge_gap(s: Any, stage: Any, prm: Any, w0: Vec, f0: Vec, w1: Vec, f1: Vec, dt: float) -> None:
     """Predict across missing samples in sub-steps, and admit that nobody knows what happened meanwhile."""
     n = math.ceil(dt / SUB_STEP)
     h = dt / n
@@ -219,16 +228,16 @@ def bridge_gap(s: Any, prm: Any, w0: Vec, f0: Vec, w1: Vec, f1: Vec, dt: float) 
         wb = (w0[0] + k1 * (w1[0] - w0[0]), w0[1] + k1 * (w1[1] - w0[1]), w0[2] + k1 * (w1[2] - w0[2]))
         fb = (f0[0] + k1 * (f1[0] - f0[0]), f0[1] + k1 * (f1[1] - f0[1]), f0[2] + k1 * (f1[2] - f0[2]))
         predict_interval(s, prm, wa, fa, wb, fb, h)
-        predict_stages(s, prm, wa, fa, wb, fb, h)
+        predict_stage(s, stage, prm, wa, fa, wb, fb, h)
     bridge_push(s, dt)
-    for i in range(len(s.a)):
-        bridge_push(s.a[i], dt)
+    if stage is not None:
+        bridge_push(stage[0], dt)
     event(s, s.t, E_GAP, NO_SENSOR, dt)
     s.n_gaps += 1
 
 
 @jit
-def advance(s: Any, prm: Any, rows: Any, cov: Any, aids: Any, tape: Any) -> None:
+def advance(s: Any, prm: Any, rows: Any, cov: Any, aids: Any, tape: Any, stage: Any) -> None:
     """Move the fusion horizon over the oldest queued IMU sample."""
     m = s.imu[s.imu_head]
     t = m.t
@@ -279,10 +288,10 @@ def advance(s: Any, prm: Any, rows: Any, cov: Any, aids: Any, tape: Any) -> None
         s.n_since += 1
         north, east = s.v[0], s.v[1]
         if dt > LONG_STEP:
-            bridge_gap(s, prm, w0, f0, w1, f1, dt)
+            bridge_gap(s, stage, prm, w0, f0, w1, f1, dt)
         else:
             predict_interval(s, prm, w0, f0, w1, f1, dt)
-            predict_stages(s, prm, w0, f0, w1, f1, dt)
+            predict_stage(s, stage, prm, w0, f0, w1, f1, dt)
         s.yaw.dv[0] += s.v[0] - north
         s.yaw.dv[1] += s.v[1] - east
         if t >= s.t_wake:
@@ -290,7 +299,7 @@ def advance(s: Any, prm: Any, rows: Any, cov: Any, aids: Any, tape: Any) -> None
                 if part == 1 and fake.blind_to_heading(s, prm):
                     write_node(s, tape, FOLLOWS)
                     kind = ASSUMED
-                fuse_all(s, prm, aids, dt, w1, f1, FAKE_POSITION * part, FAKE_POSITION + (N_SENSORS - FAKE_POSITION) * part)
+                fuse_all(s, prm, aids, dt, w1, f1, FAKE_POSITION * part, FAKE_POSITION + (N_SENSORS - FAKE_POSITION) * part, stage)
                 if s.yaw.fresh == 1:
                     s.yaw.fresh = 0
                     if prm.aid_yaw_bank > 0.0:
@@ -337,7 +346,7 @@ def behind(s: Any, prm: Any) -> bool:
 
 
 @entry
-def step(S: Any, PRM: Any, t: float, gyro: Vec, accel: Vec, rows: Any, cov: Any, aids: Any, tape: Any) -> int:
+def step(S: Any, PRM: Any, t: float, gyro: Vec, accel: Vec, rows: Any, cov: Any, aids: Any, tape: Any, stage: Any) -> int:
     """Take one IMU sample, and move the horizon as far as ``horizon`` behind it.
 
     Parameters
@@ -350,6 +359,8 @@ def step(S: Any, PRM: Any, t: float, gyro: Vec, accel: Vec, rows: Any, cov: Any,
         Angular rate [rad/s] and specific force [m/s^2], body frame.
     rows, cov, aids, tape
         Output arrays; their fill is counted in the state. Arrays without room are left alone.
+    stage
+        The first stage, see `stage_of`.
 
     Returns
     -------
@@ -359,16 +370,16 @@ def step(S: Any, PRM: Any, t: float, gyro: Vec, accel: Vec, rows: Any, cov: Any,
     s, prm = S[0], PRM[0]
     status = take(s, t, gyro, accel)
     while behind(s, prm):
-        advance(s, prm, rows, cov, aids, tape)
+        advance(s, prm, rows, cov, aids, tape, stage)
     return status
 
 
 @entry
-def flush(S: Any, PRM: Any, rows: Any, cov: Any, aids: Any, tape: Any) -> None:
+def flush(S: Any, PRM: Any, rows: Any, cov: Any, aids: Any, tape: Any, stage: Any) -> None:
     """Move the horizon to the newest IMU sample: the end of a log."""
     s, prm = S[0], PRM[0]
     while s.imu_n > 0:
-        advance(s, prm, rows, cov, aids, tape)
+        advance(s, prm, rows, cov, aids, tape, stage)
 
 
 @entry
@@ -409,6 +420,7 @@ def run_chunk(
     cov: Any,
     aids: Any,
     tape: Any,
+    stage: Any,
 ) -> tuple[int, int]:
     """Do what `offer` and `step` do, over IMU samples i ... i_end - 1 and the measurements stamped at or before them.
 
@@ -438,7 +450,7 @@ def run_chunk(
         and (tape.shape[0] == 0 or s.n_nodes <= tape.shape[0] - room)
     ):
         if behind(s, prm) or (i == len(t) and s.imu_n > 0):  # the one call of `advance` here: with a second one it is compiled twice
-            advance(s, prm, rows, cov, aids, tape)
+            advance(s, prm, rows, cov, aids, tape, stage)
         elif i < i_end:
             while j < len(stamps) and stamps[j] <= t[i]:
                 offer(S, PRM, kinds[j], stamps[j], (z[j, 0], z[j, 1], z[j, 2]), (r[j, 0], r[j, 1], r[j, 2]))
