@@ -29,7 +29,7 @@ WEIGHT_FROM, WEIGHT_TO = 2.5, 6.0
 #: Random subsets tried for a sphere that outliers do not move, and vectors in each.
 SUBSETS, SUBSET = 40, 8
 #: Rounds of weights for which a start is followed, and over about how many vectors.
-ROUNDS, THINNED = 8, 2000
+ROUNDS, THINNED = 5, 2000
 FEWEST = 30
 
 
@@ -203,7 +203,7 @@ def _start(x: FloatArray, method: str, robust: bool, refine: bool) -> FloatArray
         for k, p in enumerate(followed):
             w = _weights(_distances(p, x))
             with contextlib.suppress(HaltereError):
-                followed[k] = _gauss_newton(p, x, np.zeros(0), w, 15) if refine else _algebraic(x, w, method)
+                followed[k] = _gauss_newton(p, x, np.zeros(0), w, 8) if refine else _algebraic(x, w, method)
     distances = [np.abs(_distances(p, x)) for p in followed]
     scale = max(1.4826 * min(float(np.median(d)) for d in distances), 1e-14)
     return followed[int(np.argmin([np.sum(np.minimum(d / scale, WEIGHT_TO) ** 2) for d in distances]))]
