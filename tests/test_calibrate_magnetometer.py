@@ -533,3 +533,33 @@ def test_bench_tables_that_are_none(tmp_path: Path, text: str, words: str) -> No
     (tmp_path / "t.txt").write_text(text)
     with pytest.raises(HaltereError, match=words):
         read(tmp_path / "t.txt", {"t": "#row", **{f"magnetometer.mag_{a}": f"#{k + 1}" for k, a in enumerate("xyz")}})
+
+
+# --- the rotation ----------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("lean", [0.0, 0.6])
+def test_rotation_from_dip_says_what_it_does_not_know(lean: float) -> None:
+    """Level turns tell the rotation's horizontal part and nothing of its part about the vertical, which keeps the assumed 1 sigma."""
+    from haltere.calibrate.dip import PRIOR, turn
+    from haltere.calibrate.ellipsoid import fit
+
+    rng = np.random.default_rng(4)
+    sphere = rng.standard_normal((4000, 3))
+    e = fit(50.0 * sphere / np.linalg.norm(sphere, axis=1)[:, None])
+    yaw = rng.uniform(0.0, 2.0 * np.pi, 1500)
+    angles = np.column_stack([yaw, lean * rng.standard_normal((1500, 2))])
+    attitude = Rotation.from_euler("ZYX", angles).inv()
+    down = attitude.apply([0.0, 0.0, 1.0]) + 0.005 * rng.standard_normal((1500, 3))
+    h = attitude.apply([25.0, 0.0, 43.3])
+    found = turn(e, h @ TURN, down / np.linalg.norm(down, axis=1)[:, None])
+    assert found is not None
+    sd = np.sqrt(np.diag(found.covariance))
+    assert (np.abs(found.vector - Rotation.from_matrix(TURN).as_rotvec()) < 4.0 * sd).all()
+    assert found.dip == pytest.approx(math.atan2(43.3, 25.0), abs=4.0 * found.dip_sd)
+    if lean:
+        assert (sd < 0.2 * PRIOR).all()
+        assert (found.scatter_after, found.dip_sd) < (0.5 * found.scatter_before, math.radians(0.5))
+    else:
+        assert sd[2] == pytest.approx(PRIOR, rel=0.05)
+        assert (sd[:2] < 0.4 * PRIOR).all()

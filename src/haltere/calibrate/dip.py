@@ -19,6 +19,8 @@ FloatArray = NDArray[np.float64]
 PRIOR = math.radians(2.0)
 #: 1 sigma of the dip of the World Magnetic Model at a place [rad]: 0.2 deg of the model, the rest local.
 DIP_SD = math.radians(0.5)
+#: 1 sigma of what stays wrong with gravity's direction for a whole flight, an axis of the body [rad]: an accelerometer bias of 0.09 m/s².
+GRAVITY_SD = math.radians(0.5)
 FEWEST = 50
 #: Sine of the dip beyond which nothing is made of it (87 deg).
 STEEP = 0.9986
@@ -95,32 +97,35 @@ def turn(ellipsoid: Ellipsoid, m: FloatArray, down: FloatArray, u: FloatArray | 
     y = y / n[:, None]
     sine = np.clip(np.sum(g * y, axis=1), -1.0, 1.0)
     R = np.eye(3)
-    prior = np.diag([PRIOR**-2] * 3 + [0.0 if dip is None else DIP_SD**-2])
-    first = np.array([0.0, 0.0, 0.0, dip if dip is not None else float(np.median(np.arcsin(sine)))])
+    prior = np.diag([PRIOR**-2] * 3 + [0.0 if dip is None else DIP_SD**-2] + [GRAVITY_SD**-2] * 3)
+    first = np.zeros(7)  # rotation, dip, and what is wrong with gravity
+    first[3] = dip if dip is not None else float(np.median(np.arcsin(sine)))
     x = first.copy()
     w = np.ones(len(m))
     sigma = independent = 1.0
     cosine = np.ones(len(m))
     N = prior
-    J = np.empty((len(m), 4))
+    J = np.empty((len(m), 7))
     for _ in range(20):
         R = Rotation.from_rotvec(x[:3]).as_matrix()
         z = y @ R.T
         sine_z = np.clip(np.sum(g * z, axis=1), -STEEP, STEEP)
         cosine = np.sqrt(1.0 - sine_z * sine_z)
         # an angle: the sine would find a steep field better than a flat one, whatever the data
-        r = np.arcsin(sine_z) - x[3]
+        tilted = (z - sine_z[:, None] * g) / cosine[:, None]
+        r = np.arcsin(sine_z) - x[3] + tilted @ x[4:]
         middle = float(np.median(r))
         sigma = max(1.4826 * float(np.median(np.abs(r - middle))), 1e-6)
         w = np.minimum(1.0, 2.5 / np.maximum(np.abs(r - middle) / sigma, 1e-12))  # Huber
         sigma = max(math.sqrt(float(w @ (r * r)) / float(np.sum(w))), 1e-6)
         independent = 1.0 / correlation_time(r)
-        J = np.column_stack([np.cross(z, g) / cosine[:, None], -np.ones(len(z))])  # by a small rotation on the left, and by the dip
+        # by a small rotation on the left, the dip, and the error of gravity
+        J = np.column_stack([np.cross(z, g) / cosine[:, None], -np.ones(len(z)), tilted])
         scale = independent / (sigma * sigma)
         N = scale * (J * w[:, None]).T @ J + prior
         step = np.linalg.solve(N, -(scale * J.T @ (w * r) + prior @ (x - first)))
         x[:3] = (Rotation.from_rotvec(step[:3]) * Rotation.from_rotvec(x[:3])).as_rotvec()
-        x[3] += step[3]
+        x[3:] += step[3:]
         if float(np.max(np.abs(step))) < 1e-9:
             break
     # what the ellipsoid's errors do to it: dx = -N^-1 J^T W ∂r/∂θ dθ

@@ -39,6 +39,8 @@ DIP_ASSUMED = math.radians(60.0)
 STRENGTH_SD = 0.005
 #: Least range of a load that can be told from an offset: between its 1st and 99th percentile, in its unit.
 LEAST_RANGE = {"current": 1.0, "throttle": 0.1, "rotors": 20.0}
+#: Largest 1 sigma of roll and pitch at which gravity is used [rad]: without GNSS a filter states some degrees, and is better than it says.
+TILT_SD = math.radians(6.0)
 #: Keys of the configuration that a run needs besides the calibration.
 GIVEN = ("unit.magnetometer", "axes.magnetometer")
 #: Chance of taking a load for real that is none.
@@ -337,7 +339,7 @@ def _real(e: Ellipsoid, u: FloatArray, word: str, notes: list[str]) -> bool:
 def _gravity(
     flight: FlightLog, config: Mapping[str, Any], t: FloatArray, stream: str, C: FloatArray, notes: list[str]
 ) -> FloatArray | None:
-    """Direction of gravity in the sensor's axes (n, 3) from the navigator without magnetometer; NaN where tilt is not known to 3 deg."""
+    """Direction of gravity in the sensor's axes (n, 3) from the navigator without magnetometer; NaN where tilt is poorly known."""
     from haltere.drive import run
 
     if "imu" not in flight:
@@ -354,7 +356,7 @@ def _gravity(
     i = np.where(np.abs(solution.t[i - 1] - at) < np.abs(solution.t[i] - at), i - 1, i)
     w, x, y, z = (solution[f"q_{a}"][i] for a in "wxyz")
     down = np.column_stack([2.0 * (x * z - w * y), 2.0 * (y * z + w * x), w * w - x * x - y * y + z * z])
-    bad = (np.abs(solution.t[i] - at) > 0.1) | (np.hypot(solution["sd_roll"][i], solution["sd_pitch"][i]) > math.radians(3.0))
+    bad = (np.abs(solution.t[i] - at) > 0.1) | (np.maximum(solution["sd_roll"][i], solution["sd_pitch"][i]) > TILT_SD)
     down[bad] = np.nan
     return np.asarray(down @ C)
 
