@@ -552,6 +552,7 @@ def test_rotation_from_dip_says_what_it_does_not_know(lean: float) -> None:
     attitude = Rotation.from_euler("ZYX", angles).inv()
     down = attitude.apply([0.0, 0.0, 1.0]) + 0.005 * rng.standard_normal((1500, 3))
     h = attitude.apply([25.0, 0.0, 43.3])
+    e = replace(e, weights=np.ones(1500))
     found = turn(e, h @ TURN, down / np.linalg.norm(down, axis=1)[:, None])
     assert found is not None
     sd = np.sqrt(np.diag(found.covariance))
@@ -561,5 +562,5 @@ def test_rotation_from_dip_says_what_it_does_not_know(lean: float) -> None:
         assert (sd < 0.2 * PRIOR).all()
         assert (found.scatter_after, found.dip_sd) < (0.5 * found.scatter_before, math.radians(0.5))
     else:
-        assert sd[2] == pytest.approx(PRIOR, rel=0.05)
+        assert 0.75 * PRIOR < sd[2] < 1.01 * PRIOR  # but for what chance adds
         assert (sd[:2] < 0.4 * PRIOR).all()

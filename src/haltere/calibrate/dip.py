@@ -129,7 +129,7 @@ def turn(ellipsoid: Ellipsoid, m: FloatArray, down: FloatArray, u: FloatArray | 
         if float(np.max(np.abs(step))) < 1e-9:
             break
     # what the ellipsoid's errors do to it: dx = -N^-1 J^T W ∂r/∂θ dθ
-    inverse = np.linalg.inv(N)
+    inverse = np.linalg.inv(_without_noise(N - prior, y @ R.T, w / cosine**2, independent) + prior)
     onto = (g @ R - np.sum((g @ R) * y, axis=1)[:, None] * y) / (n * cosine)[:, None]  # by y before it has unit length
     d = m - ellipsoid.centre - np.outer(loads, ellipsoid.load)
     by = [-onto @ ellipsoid.shape, np.column_stack([np.sum(onto * (d @ b.T), axis=1) for b in BASIS])]
@@ -141,6 +141,18 @@ def turn(ellipsoid: Ellipsoid, m: FloatArray, down: FloatArray, u: FloatArray | 
     return Turn(
         x[:3], P[:3, :3], K[:3] @ ellipsoid.covariance, float(x[3]), math.sqrt(P[3, 3]), _scatter(sine), _scatter(after), len(m),
     )  # fmt: skip
+
+
+def _without_noise(N: FloatArray, z: FloatArray, w: FloatArray, independent: float) -> FloatArray:
+    """Information (7, 7) less what noise of gravity makes of itself: it moves the derivatives too, by as much as the residuals.
+
+    A rotation of which the attitudes tell nothing would seem to be known by the noise alone.
+    """
+    own = independent * (np.sum(w) * np.eye(3) - (z * w[:, None]).T @ z)
+    out = N.copy()
+    out[:3, :3] -= own
+    values, vectors = np.linalg.eigh(out)
+    return np.asarray((vectors * np.maximum(values, 0.0)) @ vectors.T)
 
 
 def _scatter(sine: FloatArray) -> float:

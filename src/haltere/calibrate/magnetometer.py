@@ -270,7 +270,7 @@ def _samples(flight: FlightLog, stream: str, notes: list[str]) -> tuple[FloatArr
     where = flight.meta.name or "flight"
     if mag is None:
         have = [s for s in flight if s.startswith("magnetometer")]
-        remedy = f"there is {', '.join(have)}" if have else "give a column map (--column)"
+        remedy = f"there is {', '.join(have)}" if have else "log it; of a table, name its columns (--column)"
         raise HaltereError(f"the stream {stream}", f"only {', '.join(flight)}", where, remedy)
     log = mag.vector("mag")
     raw, undone = raw_vectors(mag)
