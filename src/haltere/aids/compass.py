@@ -29,7 +29,7 @@ from haltere.core.rotation import Mat, Vec, dcm, quat_from_rotvec, quat_mul, qua
 from haltere.filter.robust import IGG3, inflate
 from haltere.strapdown.layout import COMPASS_BINS
 
-__all__ = ["OUT_APART", "OUT_FIELD", "OUT_TURN", "attribute", "forget", "level", "observe", "shown", "unsee"]
+__all__ = ["OUT_APART", "OUT_FIELD", "OUT_TURN", "attribute", "forget", "level", "observe", "shown", "unsee", "yaw_sd"]
 
 #: A bin of the history [s], and the smoothing of innovations while the compass is out [s].
 BIN, SLOW = 0.1, 2.0

@@ -102,7 +102,8 @@ def learn(s: Any, prm: Any, t: float, m_b: Vec, h_n: Vec, C: Mat) -> None:
     i.sd = math.sqrt(variance)
     spread = math.sqrt(i.sxx / max(i.weight, 1e-9))
     moved = math.sqrt(strength) * spread / norm(h_n)
-    sure = strength > SIGMAS * SIGMAS * variance and moved > WORTH
+    yaw_sd = compass.yaw_sd(s)  # a wrong attitude moves the field, too, in every turn: it must be much less than what is found
+    sure = strength > SIGMAS * SIGMAS * variance and moved > WORTH + 2.0 * math.cos(s.field[1]) * yaw_sd
     if i.used == 0 and sure and t - i.t_start > EARLIEST:
         use(s, prm, True)
     elif i.used == 1 and strength < 0.25 * SIGMAS * SIGMAS * variance:

@@ -1,7 +1,6 @@
 """`ahrs`: attitude and gyro bias from the IMU, with or without magnetometer, without GNSS. The same kernels as `navigator`.
 
-Velocity and position stay in the filter as what keeps gravity apart from acceleration (fake velocity, fake position), and
-are not given out.
+Velocity and position stay in the filter as what keeps gravity apart from acceleration (fake velocity), and are not given out.
 """
 
 from __future__ import annotations

@@ -106,7 +106,9 @@ KEYS: dict[str, Key] = {
     "noise.fake_position": _positive(10.0, "m", "Fake position in flight, 1 sigma at 5 Hz."),
     "noise.fake_position_rest": _positive(0.5, "m", "Fake position at rest, 1 sigma at 5 Hz."),
     "noise.fake_velocity": _positive(
-        2.0, "m/s", "Fake velocity of ahrs, 1 sigma at 5 Hz. Lower trusts gravity more, and accelerations less."
+        6.0,
+        "m/s",
+        "Fake velocity of ahrs, 1 sigma at 5 Hz: worth 2 m/s that last a second. Lower trusts gravity more, accelerations less.",
     ),
     "gate.gnss": _positive(5.0, "sigma", "Innovation gate of GNSS position and velocity, joint over the components."),
     "gate.barometer": _positive(5.0, "sigma", "Innovation gate of the barometer."),
@@ -259,7 +261,9 @@ _TWO_STAGE = tuple(key for key in KEYS if key.startswith("two_stage."))
 #: What an estimator sets differently from the defaults above.
 _OVERRIDES: dict[str, dict[str, Value]] = {
     "navigator": {},
-    "ahrs": {"aid.gnss": "off", "aid.barometer": "off", "aid.fake_velocity": "on", "baro.offset": "off"},
+    "ahrs": {
+        "aid.gnss": "off", "aid.barometer": "off", "aid.fake_velocity": "on", "aid.fake_position": "off", "baro.offset": "off",
+    },
     "two-stage": {
         "aid.magnetometer": "orthonormal", "aid.barometer": "off", "baro.offset": "off", "aid.fake_velocity": "off",
         "aid.zero_velocity": "off", "aid.zero_rate": "off", "aid.yaw_bank": "off", "aid.compass_watch": "off",
