@@ -62,19 +62,13 @@ def _rotorcraft(seed: int) -> FlightLog:
     return simulate(scenario)
 
 
-#: The simulated compass has no field of motors.
-CLEAN = {"aid.motor_field": "off"}
-#: Begun in the air with a heading 10 deg wrong, a field of motors is found that is not there in 8 of 200 flights.
-NOT_THERE = pytest.mark.xfail(strict=True, reason="a field of motors is found while the attitude is still wrong")
-
-
-def _rotorcraft_scores(flights: int, first_seed: int, told: dict[str, str]) -> tuple[dict[tuple[str, str], float], dict[str, list[float]]]:
+def _rotorcraft_scores(flights: int, first_seed: int) -> tuple[dict[tuple[str, str], float], dict[str, list[float]]]:
     """Mean NEES of each block of filter and smoother, and the mean squares of their errors."""
     nees: dict[tuple[str, str], list[float]] = {}
     squares: dict[str, list[float]] = {}
     for k in range(first_seed, first_seed + flights):
         flight = _rotorcraft(k)
-        solution = run(flight, initial=_start(flight, np.random.default_rng([7, k]), SD_ROTORCRAFT), set=told, smooth=True)
+        solution = run(flight, initial=_start(flight, np.random.default_rng([7, k]), SD_ROTORCRAFT), smooth=True)
         assert solution.smoothed is not None
         for which, rows in (("filter", solution), ("smoother", solution.smoothed)):
             for block, (_, value) in nees_series(rows, flight["truth"]).items():
@@ -85,17 +79,10 @@ def _rotorcraft_scores(flights: int, first_seed: int, told: dict[str, str]) -> t
     return {b: float(np.mean(v)) for b, v in nees.items()}, squares
 
 
-@pytest.mark.parametrize(
-    ("flights", "first", "told"),
-    [
-        (30, 500, CLEAN),
-        pytest.param(200, 2000, CLEAN, marks=pytest.mark.slow),
-        pytest.param(200, 2000, {}, marks=[pytest.mark.slow, NOT_THERE]),
-    ],
-)
-def test_nees_of_simulated_rotorcraft_is_inside_the_band(flights: int, first: int, told: dict[str, str]) -> None:
+@pytest.mark.parametrize(("flights", "first"), [(30, 500), pytest.param(200, 2000, marks=pytest.mark.slow)])
+def test_nees_of_simulated_rotorcraft_is_inside_the_band(flights: int, first: int) -> None:
     """Every block of filter and smoother inside the 99.9 % χ² band of so many flights, and the smoother's errors smaller."""
-    nees, squares = _rotorcraft_scores(flights, first, told)
+    nees, squares = _rotorcraft_scores(flights, first)
     assert set(nees) == {(which, block) for which in ("filter", "smoother") for block in DOF}
     for (which, block), value in nees.items():
         low, high = band(DOF[block], float(flights), 0.999)
@@ -110,7 +97,7 @@ def test_the_band_catches_sensors_worse_than_the_filter_is_told() -> None:
         flight = _rotorcraft(900 + k)
         start = _start(flight, np.random.default_rng([8, k]), SD_ROTORCRAFT)
         told = {"noise.gyro": 4e-4, "noise.accel": 0.009, "noise.magnetometer": 0.3, "noise.barometer": 0.15}
-        solution = run(flight, set=told | CLEAN, initial=start, smooth=True)
+        solution = run(flight, set=told, initial=start, smooth=True)
         assert solution.smoothed is not None
         for block, (_, value) in nees_series(solution.smoothed, flight["truth"]).items():
             values.setdefault(block, []).append(float(value.mean()))

@@ -16,6 +16,7 @@ from haltere.drive import run
 from haltere.estimators.base import Estimator, InitialState
 from haltere.flight.log import FlightLog, Stream
 from haltere.metrics.consistency import DOF, band, nees_series
+from haltere.metrics.errors import error_series
 from haltere.simulate import demo_flight
 from test_consistency import _start
 
@@ -510,3 +511,33 @@ def test_the_tape_of_a_quarter_of_an_hour(monkeypatch: pytest.MonkeyPatch) -> No
     assert len(seen[0]) == pytest.approx(len(seen[1]), rel=0.02)
     assert 15 * seen[0].nbytes < 100e6
     assert np.diff(seen[0][:, 0]).max() < 0.06
+
+
+def test_smoothed_attitude_alone_is_better_in_every_block() -> None:
+    """`ahrs` on six missions and a made path: heading, tilt and gyro bias together over all flights, and each mission's tilt."""
+    squares: dict[str, list[FloatArray]] = {}
+    for mission in ("hover", "climb", "box", "figure-eight", "lissajous", "tour", "path"):
+        for seed in (1, 2):
+            if mission == "path":
+                flight = demo_flight(seed, 90.0, imu_rate=100.0)
+            else:
+                flight = haltere.simulate(
+                    haltere.Scenario(
+                        vehicle="hummingbird", mission=mission, duration=90.0, seed=seed, wind={"n": 3.0, "gust": 1.0},
+                        sensors={"imu": {"rate": 100.0}},
+                    )
+                )  # fmt: skip
+            solution = run(flight, "ahrs", smooth=True)
+            assert solution.smoothed is not None
+            both = []
+            for s in (solution, solution.smoothed):
+                e = {k: float(np.mean(error_series(s, flight["truth"])[k][1] ** 2)) for k in ("roll", "pitch", "yaw")}
+                truth = flight["truth"]
+                bias = sum(np.mean((s[f"gyro_bias_{a}"] - np.interp(s.t, truth.t, truth[f"gyro_bias_{a}"])) ** 2) for a in "xyz")
+                both.append([e["roll"] + e["pitch"], e["yaw"], float(bias)])
+            squares.setdefault(mission, []).append(np.array(both))
+    for mission, found in squares.items():
+        filtered, smoothed = np.mean(found, axis=0)
+        assert smoothed[0] < filtered[0], mission
+    filtered, smoothed = np.mean([np.mean(found, axis=0) for found in squares.values()], axis=0)
+    assert (smoothed < filtered).all()

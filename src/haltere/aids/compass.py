@@ -29,7 +29,7 @@ from haltere.core.rotation import Mat, Vec, dcm, quat_from_rotvec, quat_mul, qua
 from haltere.filter.robust import IGG3, inflate
 from haltere.strapdown.layout import COMPASS_BINS
 
-__all__ = ["OUT_APART", "OUT_FIELD", "OUT_TURN", "attribute", "forget", "level", "observe", "shown", "unsee", "yaw_sd"]
+__all__ = ["OUT_APART", "OUT_FIELD", "OUT_TURN", "attribute", "forget", "level", "observe", "shown", "tilt_variance", "unsee", "yaw_sd"]
 
 #: A bin of the history [s], and the smoothing of innovations while the compass is out [s].
 BIN, SLOW = 0.1, 2.0
@@ -114,6 +114,13 @@ def yaw_sd(s: Any) -> float:
 
 
 @jit
+def tilt_variance(s: Any) -> float:
+    """Variance of one axis of tilt [rad^2], the mean of both."""
+    yaw = along(s.P, dcm((s.q[0], s.q[1], s.q[2], s.q[3]))[2], 0)
+    return max(0.0, 0.5 * (s.P[0, 0] + s.P[1, 1] + s.P[2, 2] - yaw))
+
+
+@jit
 def back(c: Any, k: int) -> int:
     """Place in the ring of the bin k bins before the newest."""
     return (c.head - 1 - k) % COMPASS_BINS
@@ -186,7 +193,8 @@ def compare(s: Any, prm: Any) -> tuple[float, float, int]:
             r += (c.bin[back(c, i)].d - c.bin[back(c, k + i)].d) / w
         r -= now.drift - b.drift - b.bias * span
         wrong = prm.noise_gyro_scale * (now.path - b.path)
-        sd = math.sqrt(2.0 * c.noise / w + prm.noise_gyro * prm.noise_gyro * span + b.bias_var * span * span + wrong * wrong)
+        tilted = math.tan(s.field[1]) * math.tan(s.field[1]) * b.tilt_var  # a tilt that was mended since turns the levelled heading
+        sd = math.sqrt(2.0 * c.noise / w + prm.noise_gyro * prm.noise_gyro * span + b.bias_var * span * span + wrong * wrong + tilted)
         same = now.q[0] * b.q[0] + now.q[1] * b.q[1] + now.q[2] * b.q[2] + now.q[3] * b.q[3]
         turned = 2.0 * math.sqrt(max(0.0, 1.0 - same * same))  # chord of the rotation: how far a fixed error of the field has moved
         limit = allowed(s, prm) + prm.robust_calibration * turned / math.cos(s.field[1]) + SIGMAS * sd
@@ -228,7 +236,7 @@ def close_bin(s: Any, prm: Any) -> None:
     c.path_before, c.t_close = c.path, c.t_last
     b.path = c.path
     b.bias = d[0] * s.bg[0] + d[1] * s.bg[1] + d[2] * s.bg[2]
-    b.yaw_var, b.bias_var = along(s.P, d, 0), along(s.P, d, 9)
+    b.yaw_var, b.tilt_var, b.bias_var = along(s.P, d, 0), tilt_variance(s), along(s.P, d, 9)
     for i in range(4):
         b.q[i] = q[i]
     c.head = (c.head + 1) % COMPASS_BINS

@@ -24,6 +24,8 @@ SLOW, MEMORY, STALE = 5.0, 120.0, 1.0
 SIGMAS, WORTH, EARLIEST = 8.0, 0.01, 10.0
 #: Residuals are alike for about this long [s]: samples within it are one.
 ALIKE = 0.5
+#: Part of the field by which a wrong attitude may turn it, 1 sigma, while the regression learns.
+SETTLED = 0.1
 #: Part of the field that a change of the current may move unseen.
 UNSURE = 0.04
 
@@ -67,14 +69,17 @@ def learn(s: Any, prm: Any, t: float, m_b: Vec, h_n: Vec, C: Mat) -> None:
     i = s.motors
     if t - i.t_load > STALE:
         return
+    if i.known == 0:
+        i.known, i.reference, i.t_last = 1, i.current, -1e9
+    unsettled = math.cos(s.field[1]) * compass.yaw_sd(s) + math.sqrt(compass.tilt_variance(s))
+    if unsettled > SETTLED:  # an attitude that is being corrected moves the field, too
+        return
     dt = t - i.t_last
     u = i.current
     h = tmat_vec(C, h_n)
     y = (m_b[0] - h[0], m_b[1] - h[1], m_b[2] - h[2])
-    if i.known == 0:
-        i.reference = u
-    if i.known == 0 or dt > 1.0 or dt <= 0.0:
-        i.known, i.t_last, i.mean_u = 1, t, u
+    if dt > 1.0 or dt <= 0.0:
+        i.t_last, i.mean_u = t, u
         for a in range(3):
             i.mean_y[a] = y[a]
         return
@@ -102,8 +107,7 @@ def learn(s: Any, prm: Any, t: float, m_b: Vec, h_n: Vec, C: Mat) -> None:
     i.sd = math.sqrt(variance)
     spread = math.sqrt(i.sxx / max(i.weight, 1e-9))
     moved = math.sqrt(strength) * spread / norm(h_n)
-    yaw_sd = compass.yaw_sd(s)  # a wrong attitude moves the field, too, in every turn: it must be much less than what is found
-    sure = strength > SIGMAS * SIGMAS * variance and moved > WORTH + 2.0 * math.cos(s.field[1]) * yaw_sd
+    sure = strength > SIGMAS * SIGMAS * variance and moved > WORTH
     if i.used == 0 and sure and t - i.t_start > EARLIEST:
         use(s, prm, True)
     elif i.used == 1 and strength < 0.25 * SIGMAS * SIGMAS * variance:

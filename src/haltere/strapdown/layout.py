@@ -140,6 +140,7 @@ COMPASS_BIN = _record(
     ("path", "f8"),  # integral of the rate's size [rad], and that size [rad/s]
     ("rate", "f8"),
     ("yaw_var", "f8"),
+    ("tilt_var", "f8"),
     ("bias_var", "f8"),
     ("q", "f8", 4),
 )
