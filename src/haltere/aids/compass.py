@@ -193,7 +193,8 @@ def compare(s: Any, prm: Any) -> tuple[float, float, int]:
             r += (c.bin[back(c, i)].d - c.bin[back(c, k + i)].d) / w
         r -= now.drift - b.drift - b.bias * span
         wrong = prm.noise_gyro_scale * (now.path - b.path)
-        tilted = math.tan(s.field[1]) * math.tan(s.field[1]) * b.tilt_var  # a tilt that was mended since turns the levelled heading
+        mended = max(0.0, b.tilt_var - now.tilt_var)  # a tilt that was mended since has turned the levelled heading
+        tilted = math.tan(s.field[1]) * math.tan(s.field[1]) * mended
         sd = math.sqrt(2.0 * c.noise / w + prm.noise_gyro * prm.noise_gyro * span + b.bias_var * span * span + wrong * wrong + tilted)
         same = now.q[0] * b.q[0] + now.q[1] * b.q[1] + now.q[2] * b.q[2] + now.q[3] * b.q[3]
         turned = 2.0 * math.sqrt(max(0.0, 1.0 - same * same))  # chord of the rotation: how far a fixed error of the field has moved
