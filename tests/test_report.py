@@ -439,6 +439,8 @@ def test_every_colour_a_figure_names_is_there(text: str) -> None:
 
 
 def test_report_reads_no_kernels() -> None:
+    """Nor anything that could compute what it draws; the page on a calibration draws the room that made it."""
+    besides = {"calibration.py": ("haltere.calibrate", "haltere.readers")}
     for path in Path(sys.modules["haltere.report"].__path__[0]).glob("*.py"):
         for name in re.findall(r"^\s*(?:from|import) (haltere\.[a-z]+)", path.read_text(encoding="utf-8"), re.MULTILINE):
-            assert name in ("haltere.flight", "haltere.metrics", "haltere.report"), f"{path.name}: {name}"
+            assert name in ("haltere.flight", "haltere.metrics", "haltere.report", *besides.get(path.name, ())), f"{path.name}: {name}"

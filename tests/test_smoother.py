@@ -514,7 +514,7 @@ def test_the_tape_of_a_quarter_of_an_hour(monkeypatch: pytest.MonkeyPatch) -> No
 
 
 def test_smoothed_attitude_alone_is_better_in_every_block() -> None:
-    """`ahrs` on six missions and a made path: heading, tilt and gyro bias together over all flights, and each mission's tilt."""
+    """`ahrs` on six missions and a made path: tilt, heading and gyro bias, two flights of each."""
     squares: dict[str, list[FloatArray]] = {}
     for mission in ("hover", "climb", "box", "figure-eight", "lissajous", "tour", "path"):
         for seed in (1, 2):
@@ -538,6 +538,4 @@ def test_smoothed_attitude_alone_is_better_in_every_block() -> None:
             squares.setdefault(mission, []).append(np.array(both))
     for mission, found in squares.items():
         filtered, smoothed = np.mean(found, axis=0)
-        assert smoothed[0] < filtered[0], mission
-    filtered, smoothed = np.mean([np.mean(found, axis=0) for found in squares.values()], axis=0)
-    assert (smoothed < filtered).all()
+        assert (smoothed < filtered).all(), (mission, filtered, smoothed)

@@ -88,9 +88,12 @@ def check(flight: FlightLog, *, upright: bool = True, given: Mapping[str, Any] |
     rules = (("magnetometer", _check_magnetometer), ("gnss", _check_gnss), ("barometer", _check_barometer))
     for name, rule in rules:
         stream = flight.get(name)
-        if stream is None or not len(stream):
+        if stream is None:
             continue
         n = len(stream)
+        if n == 0:
+            out.warnings.append(f"{name}: the log has the stream, but not one sample in it")
+            continue
         cleaned = _check_held(out, name, rule(out, _clean_time(out, name, stream)))
         if len(cleaned):
             out.streams[name] = cleaned
