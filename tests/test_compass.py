@@ -401,3 +401,20 @@ def test_online_is_offline_with_current_and_disturbance() -> None:
     for t, want in zip(solution.t[::500], q[::500], strict=True):
         if (key := round(float(t), 9)) in known:
             np.testing.assert_array_equal(known[key], want)
+
+
+def test_a_field_that_was_wrong_and_is_right_again_is_heard_again() -> None:
+    """Strength off by half for ten seconds: out for the field, back five seconds after it ends, with a degree of noise."""
+    rng = np.random.default_rng(6)
+    s, prm = hovering()
+    t = np.arange(0.0, 60.0, 0.02)
+    C = tuple(tuple(float(x) for x in row) for row in np.eye(3))
+    out = []
+    for ti in t:
+        s["t"] = ti
+        e = 1.0 * DEG * rng.standard_normal()
+        out.append(compass.observe(s, prm, float(ti), float(e - s["yaw_corrected"]), 0.0 if 20.0 <= ti < 30.0 else 1.0, True, C))
+    refused = np.array(out) == R_DISTURBED
+    assert refused[(t > 20.5) & (t < 34.9)].all()
+    assert not refused[t < 20.0].any()
+    assert not refused[t > 40.0].any()

@@ -163,7 +163,8 @@ def put_out(s: Any, prm: Any, k: int, cause: Any, value: float, threshold: float
     if c.filled > 0:
         c.onset, c.level = c.bin[back(c, k)].t, c.bin[back(c, k)].d
         take_back(s, prm, k)
-    c.out, c.t_good, c.jump, c.yaw_sd = cause, c.t_last, abs(value) if cause != OUT_FIELD else prm.robust_heading, yaw_sd(s)
+    c.out, c.t_good, c.yaw_sd = cause, c.t_last, yaw_sd(s)
+    c.jump = 2.0 * allowed(s, prm) if cause == OUT_FIELD else abs(value)
     event_since(s, c.t_last, c.onset, E_DISTURBED, MAGNETOMETER, value, threshold, cause)
 
 
