@@ -29,7 +29,7 @@ from haltere.core.rotation import Mat, Vec, dcm, quat_from_rotvec, quat_mul, qua
 from haltere.filter.robust import IGG3, inflate
 from haltere.strapdown.layout import COMPASS_BINS
 
-__all__ = ["OUT_APART", "OUT_FIELD", "OUT_TURN", "attribute", "forget", "level", "observe", "shown", "tilt_variance", "unsee", "yaw_sd"]
+__all__ = ["OUT_APART", "OUT_FIELD", "OUT_TURN", "attribute", "forget", "level", "observe", "tilt_variance", "unsee", "yaw_sd"]
 
 #: A bin of the history [s], and the smoothing of innovations while the compass is out [s].
 BIN, SLOW = 0.1, 2.0
@@ -329,9 +329,3 @@ def observe(s: Any, prm: Any, t: float, e: float, weight: float, steady: bool, C
             k += 1
         put_out(s, prm, k, OUT_FIELD, c.bad, BAD_SHARE)
     return R_NONE if c.out == 0 else R_DISTURBED
-
-
-@jit
-def shown(s: Any) -> float:
-    """Turn about the vertical that the compass shows against the filter's corrections [rad], unwrapped: D of the module's docstring."""
-    return float(s.compass.last)
