@@ -418,3 +418,18 @@ def test_a_field_that_was_wrong_and_is_right_again_is_heard_again() -> None:
     assert refused[(t > 20.5) & (t < 34.9)].all()
     assert not refused[t < 20.0].any()
     assert not refused[t > 40.0].any()
+
+
+def test_a_field_that_has_changed_for_good_is_believed_some_day() -> None:
+    """Thirty per cent stronger from 20 s on, heading right: out at once, heard again within four minutes and not within ten seconds."""
+    s, prm = hovering()
+    C = tuple(tuple(float(x) for x in row) for row in np.eye(3))
+    back = math.inf
+    for ti in np.arange(0.0, 260.0, 0.02):
+        s["t"] = ti
+        weight, _ = compass.level(s, prm, 48.0 if ti < 20.0 else 62.4, 60.0 * DEG, 0.02)
+        reason = compass.observe(s, prm, float(ti), float(-s["yaw_corrected"]), weight, True, C)
+        if ti > 21.0 and reason == R_NONE:
+            back = float(ti)
+            break
+    assert 30.0 < back < 260.0

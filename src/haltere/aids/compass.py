@@ -29,7 +29,20 @@ from haltere.core.rotation import Mat, Vec, dcm, quat_from_rotvec, quat_mul, qua
 from haltere.filter.robust import IGG3, inflate
 from haltere.strapdown.layout import COMPASS_BINS
 
-__all__ = ["OUT_APART", "OUT_FIELD", "OUT_TURN", "attribute", "forget", "level", "observe", "tilt_variance", "unsee", "yaw_sd"]
+__all__ = [
+    "OUT_APART",
+    "OUT_FIELD",
+    "OUT_TURN",
+    "along",
+    "attribute",
+    "forget",
+    "level",
+    "observe",
+    "tilt_variance",
+    "unsee",
+    "vertical_bias",
+    "yaw_sd",
+]
 
 #: A bin of the history [s], and the smoothing of innovations while the compass is out [s].
 BIN, SLOW = 0.1, 2.0
@@ -82,7 +95,8 @@ def level(s: Any, prm: Any, strength: float, dip: float, dt: float) -> tuple[flo
     """Weight that strength [uT] and dip [rad] of a sample leave it, and the reason to refuse it, against the field of the flight so far.
 
     The reference begins at the first sample and follows with `FOLLOW` what is not refused: a compass with a calibration of its own
-    is compared with itself. Absolute bounds against the Earth's field are tested elsewhere (aids.magnetometer).
+    is compared with itself. While the compass is out it follows anything, slowly, so that a field that has changed for good is believed
+    some day; its heading must agree all the same. Absolute bounds against the Earth's field are tested elsewhere (aids.magnetometer).
     """
     c = s.compass
     if c.known == 0:
@@ -90,21 +104,29 @@ def level(s: Any, prm: Any, strength: float, dip: float, dt: float) -> tuple[flo
     by_strength = inflate(IGG3, abs(strength / c.strength - 1.0) / prm.robust_strength, SOFT, HARD_LIMIT)
     by_dip = inflate(IGG3, abs(dip - c.dip) / prm.robust_dip, SOFT, HARD_LIMIT)
     worst = max(by_strength, by_dip)
-    if worst > 1e3:
-        return 0.0, R_STRENGTH if by_strength >= by_dip else R_DIP
-    if c.out == 0:
-        k = min(1.0, dt / FOLLOW) / worst
+    refused = worst > 1e3
+    if c.out != 0 or not refused:
+        k = min(1.0, max(dt, 0.0) / FOLLOW) / (4.0 if c.out != 0 else worst)
         c.strength += k * (strength - c.strength)
         c.dip += k * (dip - c.dip)
+    if refused:
+        return 0.0, R_STRENGTH if by_strength >= by_dip else R_DIP
     return 1.0 / worst, R_NONE
+
+
+@jit
+def vertical_bias(s: Any) -> float:
+    """Gyro bias about the vertical [rad/s]."""
+    d = dcm((s.q[0], s.q[1], s.q[2], s.q[3]))[2]
+    return float(d[0] * s.bg[0] + d[1] * s.bg[1] + d[2] * s.bg[2])
 
 
 @jit
 def attribute(s: Any, yaw: float, bias: float) -> None:
     """Book on the compass what its update did: ``yaw`` is ``s.yaw_corrected`` before it, ``bias`` the vertical gyro bias."""
-    c, d = s.compass, dcm((s.q[0], s.q[1], s.q[2], s.q[3]))[2]
+    c = s.compass
     c.pulled += s.yaw_corrected - yaw
-    c.pulled_bias += d[0] * s.bg[0] + d[1] * s.bg[1] + d[2] * s.bg[2] - bias
+    c.pulled_bias += vertical_bias(s) - bias
 
 
 @jit

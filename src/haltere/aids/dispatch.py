@@ -31,7 +31,7 @@ from haltere.aids.record import (
     ZERO_RATE,
     ZERO_VELOCITY,
 )
-from haltere.core.rotation import Vec, dcm
+from haltere.core.rotation import Vec
 from haltere.filter.queue import pop_due
 
 __all__ = ["N_SENSORS", "due", "fuse_all", "offer_of"]
@@ -105,9 +105,10 @@ def fuse_all(s: Any, prm: Any, aids: Any, dt: float, w: Vec, f: Vec, first: int,
         if i >= 0:
             m = s.ring[sensor if sensor < N_QUEUED else 0, i]
             resting = s.rest.still == 1 and s.rest.moved == 0
-            d = dcm((s.q[0], s.q[1], s.q[2], s.q[3]))[2]
             offer = offer_of(s, prm, sensor, m, aids, dt, w, resting, stage)
-            yaw, bias = s.yaw_corrected, d[0] * s.bg[0] + d[1] * s.bg[1] + d[2] * s.bg[2]
+            yaw, bias = s.yaw_corrected, 0.0
+            if sensor == MAGNETOMETER:
+                bias = compass.vertical_bias(s)
             fused = s.aid[sensor].n_fused
             fuse_offer(s, aids, t, sensor, offer)
             if sensor == MAGNETOMETER:

@@ -56,12 +56,7 @@ def heading_row(C: Mat, declination: float, dip: float) -> Vec:
 @jit
 def yaw_variance(s: Any, C: Mat) -> float:
     """Variance of the attitude error about the vertical [rad^2]."""
-    P, d = s.P, C[2]
-    total = 0.0
-    for i in range(3):
-        for j in range(3):
-            total += d[i] * P[i, j] * d[j]
-    return total
+    return compass.along(s.P, C[2], 0)
 
 
 @jit

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from haltere.errors import HaltereError, UsageError
 from haltere.flight.log import FlightLog
 
-__all__ = ["LOADS", "load_at", "loads_of"]
+__all__ = ["LOADS", "load_at", "loads_of", "series"]
 
 FloatArray = NDArray[np.float64]
 
@@ -20,8 +20,8 @@ LOADS: dict[str, tuple[str, tuple[str, ...], str]] = {
 }
 
 
-def _series(flight: FlightLog, word: str) -> tuple[FloatArray, FloatArray] | None:
-    """Times and values, in order of time; the mean over the rotors."""
+def series(flight: FlightLog, word: str) -> tuple[FloatArray, FloatArray] | None:
+    """Times (n,) [s] and values (n,) of a load by its word, in order of time, the mean over the rotors; None where there are not two."""
     _, streams, stem = LOADS[word]
     for name in streams:
         stream = flight.get(name)
@@ -40,7 +40,7 @@ def _series(flight: FlightLog, word: str) -> tuple[FloatArray, FloatArray] | Non
 
 def loads_of(flight: FlightLog) -> tuple[str, ...]:
     """Words of the loads that a flight has."""
-    return tuple(word for word in LOADS if _series(flight, word) is not None)
+    return tuple(word for word in LOADS if series(flight, word) is not None)
 
 
 def load_at(flight: FlightLog, word: str, t: FloatArray) -> FloatArray:
@@ -64,12 +64,12 @@ def load_at(flight: FlightLog, word: str, t: FloatArray) -> FloatArray:
     """
     if word not in LOADS:
         raise UsageError(f"a load: {', '.join(LOADS)}", repr(word), "load")
-    series = _series(flight, word)
-    if series is None:
+    found = series(flight, word)
+    if found is None:
         unit, streams, stem = LOADS[word]
         have = loads_of(flight)
         raise HaltereError(
             f"{stem.rstrip('_')} [{unit}] in the stream {' or '.join(streams)}", "none", f"{flight.meta.name or 'flight'}: load {word}",
             f"the flight has {', '.join(have)}" if have else "set magnetometer.load=off, or log it",
         )  # fmt: skip
-    return np.asarray(np.interp(t, *series))
+    return np.asarray(np.interp(t, *found))

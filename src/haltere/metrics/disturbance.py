@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from haltere.flight.load import series
 from haltere.flight.log import FlightLog
 from haltere.flight.solution import Solution
 from haltere.metrics.magnetism import clean
@@ -85,17 +86,10 @@ def _yaw(solution: Solution) -> FloatArray:
 def _loads(solution: Solution, flight: FlightLog) -> list[tuple[str, FloatArray, FloatArray]]:
     """What a disturbance may follow: name, times and values."""
     out: list[tuple[str, FloatArray, FloatArray]] = []
-    power = flight.get("power")
-    if power is not None:
-        tp, x = clean(power.t, power.get("current")[:, None])
-        out.append(("the battery current", tp, x[:, 0]))
-    for stream in ("actuators", "rotors"):
-        rotors = flight.get(stream)
-        names = [] if rotors is None else [n for n in rotors.names if n.startswith("command_")]
-        if rotors is not None and names:
-            tr, x = clean(rotors.t, np.column_stack([rotors[n] for n in names]))
-            out.append(("the throttle", tr, x.mean(axis=1)))
-            break
+    for word, name in (("current", "the battery current"), ("throttle", "the throttle")):
+        found = series(flight, word)
+        if found is not None:
+            out.append((name, *found))
     imu = flight["imu"]
     ti, force = clean(imu.t, np.linalg.norm(imu.vector("accel"), axis=1)[:, None])
     out.append(("the thrust", ti, force[:, 0]))

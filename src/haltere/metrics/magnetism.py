@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from haltere.flight.field import decimal_year, earth_field
+from haltere.flight.load import series
 from haltere.flight.log import FlightLog, Stream
 from haltere.flight.solution import Solution
 
@@ -142,17 +143,9 @@ def field_load(flight: FlightLog, stream: str = "magnetometer") -> dict[str, Any
 
 
 def _load(flight: FlightLog) -> tuple[str, FloatArray, FloatArray] | None:
-    """Name, times and values of what the motors draw: battery current [A], else the mean rotor command (0-1)."""
-    power = flight.get("power")
-    if power is not None:
-        t, x = clean(power.t, power.get("current")[:, None])
-        if len(t) > 10 and float(np.ptp(x)) > 1.0:
-            return "current", t, x[:, 0]
-    for stream in ("actuators", "rotors"):
-        rotors = flight.get(stream)
-        names = [] if rotors is None else [n for n in rotors.names if n.startswith("command_")]
-        if rotors is not None and names:
-            t, x = clean(rotors.t, np.column_stack([rotors[n] for n in names]))
-            if len(t) > 10:
-                return "throttle", t, x.mean(axis=1)
+    """Name, times and values of what the motors draw: battery current [A] where it varies, else the mean rotor command (0-1)."""
+    for word, least in (("current", 1.0), ("throttle", 0.0)):
+        found = series(flight, word)
+        if found is not None and len(found[0]) > 10 and float(np.ptp(found[1])) >= least:
+            return word, *found
     return None
