@@ -27,6 +27,7 @@ from haltere.flight.local import geodetic_from_local
 from haltere.flight.log import FlightLog
 from haltere.flight.solution import Solution
 from haltere.metrics.disturbance import describe, disturbances
+from haltere.diagnosis.findings import findings
 from haltere.metrics.summary import summarise
 from haltere.strapdown.layout import IMU_CAPACITY
 
@@ -222,6 +223,9 @@ def _drain(S: NDArray[np.void], aids: NDArray[np.void], parts: list[NDArray[np.v
         S["n_aids"] = 0
     for e in S["event"][0, : int(S["n_events"][0])]:
         kind = EVENTS[int(e["code"])]
+        if kind in ("fault", "suspect", "over"):
+            findings(kind, e, events)
+            continue
         named = kind in ("reset", "timeout", "recovered", "disturb")
         sensor = SENSORS[int(e["sensor"])] if named else ("imu" if kind == "gap" else "filter")
         events.append(_event(kind, sensor, e, int(e["sensor"]) == YAW_BANK))

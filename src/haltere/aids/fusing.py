@@ -7,10 +7,12 @@ from typing import Any
 
 from haltere._jit import constant, jit
 from haltere.aids.record import (
+    C_MAG,
     DEWEIGHTED,
     E_TIMEOUT,
     FUSED,
     HELD,
+    MAGNETOMETER,
     R_DISTRUSTED,
     R_INNOVATION,
     R_NONE,
@@ -22,6 +24,7 @@ from haltere.aids.record import (
 from haltere.core.rotation import Vec, dcm
 from haltere.filter.gates import ABSENT, inflation, joint_nis, optimal_gain
 from haltere.filter.robust import PLAIN, inflate
+from haltere.filter.signatures import matched
 from haltere.filter.update import NONE, Row, apply, innovation, project, variance
 from haltere.strapdown.propagate import inject
 
@@ -161,11 +164,19 @@ def fuse_offer(s: Any, aids: Any, t: float, sensor: int, offer: Offer) -> None:
             elif i == 2:
                 row, r_i, e_i, ok = H2, r[2], e[2], ok2
             if ok:
-                optimal_gain(s, row, r_i)
+                variance_i = optimal_gain(s, row, r_i)
                 if turn != ANY_TURN:
                     project_gain(s, turn == ONLY_TURN)
-                apply(s, row, r_i, innovation(s, row, e_i))
+                e_i = innovation(s, row, e_i)
+                if len(s.bank) > 0:
+                    matched(s, row, variance_i, e_i, component + i, sensor <= MAGNETOMETER and component != C_MAG, True)
+                apply(s, row, r_i, e_i)
         inject(s)
+    elif len(s.bank) > 0 and reason == R_INNOVATION and sensor <= MAGNETOMETER and component != C_MAG:
+        for i in range(n):  # what the filter refuses is evidence all the same
+            row = H0 if i == 0 else (H1 if i == 1 else H2)
+            if z[i] == z[i]:
+                matched(s, row, s_ii[i], e[i], component + i, True, False)
     for i in range(n):
         if z[i] == z[i]:
             record(s, aids, t, sensor, component + i, z[i], e[i], math.sqrt(s_ii[i]), ratio, weight, status, reason)

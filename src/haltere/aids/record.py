@@ -54,8 +54,11 @@ R_NONE, R_INNOVATION, R_TIMEOUT, R_START, R_STRENGTH, R_DIP, R_HORIZONTAL, R_ALI
     constant(i) for i in range(10)
 )
 
-EVENTS = ("aligned", "reset", "diverged", "realigned", "gap", "recovered", "timeout", "disturb")
-E_ALIGNED, E_RESET, E_DIVERGED, E_REALIGNED, E_GAP, E_RECOVERED, E_TIMEOUT, E_DISTURBED = (constant(i) for i in range(8))
+#: The last three are findings of `haltere.diagnosis`: a fault that is named, one of several, and the end of one.
+EVENTS = ("aligned", "reset", "diverged", "realigned", "gap", "recovered", "timeout", "disturb", "fault", "suspect", "over")
+E_ALIGNED, E_RESET, E_DIVERGED, E_REALIGNED, E_GAP, E_RECOVERED, E_TIMEOUT, E_DISTURBED, E_FAULT, E_SUSPECT, E_OVER = (
+    constant(i) for i in range(11)
+)
 
 AID_RECORD = np.dtype(
     [
@@ -121,6 +124,7 @@ def event_since(s: Any, t: float, onset: float, code: int, sensor: int, value: f
     if i < len(s.event):
         e = s.event[i]
         e.t, e.onset, e.code, e.sensor, e.value, e.threshold, e.detail = t, onset, code, sensor, value, threshold, detail
+        e.seen, e.size, e.sd, e.candidates = t, math.nan, math.nan, 0
         s.n_events = i + 1
     else:
         s.n_events_lost += 1

@@ -117,7 +117,8 @@ class InitialState:
 def new_state(config: Config, initial: InitialState | None = None) -> NDArray[np.void]:
     """State record, one element, that has seen nothing yet."""
     offsets = 1 if config["baro.offset"] == "on" else 0, 3 if config["magnetometer.refine"] == "on" else 0
-    record = as_records(np.zeros(1, layout(*offsets, 1 if config.estimator == "two-stage" else 0)))
+    banks = 1 if config["diagnosis.inertial"] == "on" else 0
+    record = as_records(np.zeros(1, layout(*offsets, 1 if config.estimator == "two-stage" else 0, banks)))
     record["q"][0, 0] = 1.0
     home = (config.number("home.lat"), config.number("home.lon"), config.number("home.alt"))
     record["gravity"] = STANDARD_GRAVITY

@@ -6,6 +6,7 @@ import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
+from statistics import NormalDist
 from typing import Any
 
 import numpy as np
@@ -23,12 +24,14 @@ from haltere.flight.field import decimal_year, earth_field
 from haltere.flight.log import FlightLog, Stream
 from haltere.strapdown.layout import PARAMETERS
 
-__all__ = ["Measurements", "configure", "horizon", "imu_arrays", "measurements", "parameters", "request"]
+__all__ = ["Measurements", "alarm_level", "configure", "horizon", "imu_arrays", "measurements", "parameters", "request"]
 
 FloatArray = NDArray[np.float64]
 
 #: How far the fusion horizon runs behind the largest delay [s] (theory-amendments.md §8).
 HORIZON_MARGIN = 0.05
+#: Faults that are told apart, judgements of them a second, and the factor for innovations that are not white.
+FAMILIES, JUDGEMENTS, COLOURED = 14.0, 10.0, 1.0
 
 
 @dataclass
@@ -123,14 +126,24 @@ def parameters(config: Config) -> NDArray[np.void]:
     """Parameter record, one element, of a configuration."""
     record = as_records(np.zeros(1, PARAMETERS))
     for name in PARAMETERS.names or ():
-        if name in ("horizon", "covariance_interval", "imu_mean"):
+        if name in ("horizon", "covariance_interval", "imu_mean", "diagnosis_threshold"):
             continue
         head = "two_stage" if name.startswith("two_stage_") else name.partition("_")[0]
         record[name] = config.number(f"{head}.{name[len(head) + 1 :]}")
     record["imu_mean"] = config.number("imu.kind")
     record["horizon"] = horizon(config)
     record["covariance_interval"] = 0.1
+    record["diagnosis_threshold"] = alarm_level(config.number("diagnosis.false_alarms"))
     return record
+
+
+def alarm_level(rate: float) -> float:
+    """Level of a statistic χ²(1) that is passed ``rate`` times an hour without a fault (theory-amendments.md §5).
+
+    Fourteen families are judged ten times a second, each as the maximum over onsets, which is passed 4.4 times as often as one of them.
+    """
+    p = rate / (3600.0 * 4.4 * FAMILIES * JUDGEMENTS)
+    return NormalDist().inv_cdf(0.5 * p) ** 2 * COLOURED
 
 
 def imu_arrays(flight: FlightLog, checked: Checked) -> tuple[FloatArray, FloatArray, FloatArray]:

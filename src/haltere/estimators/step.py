@@ -21,6 +21,7 @@ from haltere.aids.record import (
     event,
 )
 from haltere.core.rotation import Vec, cross, dcm, mat_vec, quat_from_rotvec, quat_mul
+from haltere.diagnosis import inertial
 from haltere.estimators import alignment, yaw_bank
 from haltere.filter.queue import pop_imu, push, push_imu
 from haltere.strapdown.propagate import predict
@@ -192,7 +193,9 @@ def interval(s: Any, prm: Any, w0: Vec, f0: Vec, w1: Vec, f1: Vec, dt: float) ->
 def predict_interval(s: Any, prm: Any, w0: Vec, f0: Vec, w1: Vec, f1: Vec, dt: float) -> None:
     """Predict over one interval between raw IMU samples, see `interval`."""
     w, f, rotation, dv = interval(s, prm, w0, f0, w1, f1, dt)
-    predict(s, prm, w, f, rotation, dv, dt)
+    D, A, B = predict(s, prm, w, f, rotation, dv, dt)
+    if len(s.bank) > 0:
+        inertial.carry(s, D, A, B, dt)
 
 
 @jit
@@ -304,6 +307,8 @@ def advance(s: Any, prm: Any, rows: Any, cov: Any, aids: Any, tape: Any, stage: 
                     s.yaw.fresh = 0
                     if prm.aid_yaw_bank > 0.0:
                         yaw_bank.update(s, s.yaw.z[0], s.yaw.z[1], s.yaw.r)
+        if len(s.bank) > 0 and inertial.tick(s, prm, dt):  # what was before it is smoothed by itself
+            node, kind = True, BEGINS
     if t >= s.t_covariance and not sound(s):
         event(s, t, E_DIVERGED, NO_SENSOR, 0.0)
         alignment.begin(s, t)

@@ -215,6 +215,12 @@ KEYS: dict[str, Key] = {
     "two_stage.height_sign": _switch(
         "minus", "Down position of a fix is minus the height above the origin; plus is a misprint of the source.", ("minus", "plus")
     ),
+    "diagnosis.inertial": _switch(
+        "on", "Look for faults of gyro and accelerometer axes by their signature in the innovations, name them, and take their effect back."
+    ),
+    "diagnosis.false_alarms": _positive(0.035, "1/h", "Wanted rate of false alarms; lower finds faults later."),
+    "diagnosis.gyro": Key(0.3 * DEG, "rad/s", "Change of a gyro bias that is no fault.", low=0.0),
+    "diagnosis.accel": Key(0.08, "m/s^2", "Change of an accelerometer bias that is no fault.", low=0.0),
     "imu.kind": _switch("instant", "An IMU sample is the value at its time, or the mean since the sample before.", ("instant", "mean")),
     "baro.temperature": Key(
         math.nan, "K", "Air temperature at the ground, scales pressure altitude. Default: standard atmosphere.", low=200.0, high=330.0
@@ -257,17 +263,19 @@ GROUPS: dict[str, tuple[str, ...]] = {
     "axes.imu": ("axes.gyro", "axes.accel"),
 }
 
+_DIAGNOSIS = tuple(key for key in KEYS if key.startswith("diagnosis."))
 _TWO_STAGE = tuple(key for key in KEYS if key.startswith("two_stage."))
 #: What an estimator sets differently from the defaults above.
 _OVERRIDES: dict[str, dict[str, Value]] = {
     "navigator": {},
     "ahrs": {
         "aid.gnss": "off", "aid.barometer": "off", "aid.fake_velocity": "on", "aid.fake_position": "off", "baro.offset": "off",
+        "diagnosis.inertial": "off",
     },
     "two-stage": {
         "aid.magnetometer": "orthonormal", "aid.barometer": "off", "baro.offset": "off", "aid.fake_velocity": "off",
         "aid.zero_velocity": "off", "aid.zero_rate": "off", "aid.yaw_bank": "off", "aid.compass_watch": "off",
-        "aid.motor_field": "off", "two_stage.radial": 0.05, "two_stage.memory": 10.0,
+        "aid.motor_field": "off", "diagnosis.inertial": "off", "two_stage.radial": 0.05, "two_stage.memory": 10.0,
     },
 }  # fmt: skip
 _NO_GATE = 1e6
@@ -286,7 +294,7 @@ _PRESET_OVERRIDES["two-stage", "as-printed"] = _PRESET_OVERRIDES["two-stage", "a
 #: Keys that an estimator does not have: changing them would change nothing, or make it another one.
 _FIXED: dict[str, tuple[str, ...]] = {
     "navigator": _TWO_STAGE,
-    "ahrs": (*_OVERRIDES["ahrs"], *_TWO_STAGE),
+    "ahrs": (*_OVERRIDES["ahrs"], *_TWO_STAGE, *_DIAGNOSIS),
     "two-stage": (
         "aid.barometer",
         "baro.offset",
@@ -296,6 +304,7 @@ _FIXED: dict[str, tuple[str, ...]] = {
         "aid.yaw_bank",
         "aid.compass_watch",
         "aid.motor_field",
+        *_DIAGNOSIS,
         "magnetometer.refine",
         "noise.mag_offset",
         "init.mag_offset",

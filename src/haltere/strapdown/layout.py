@@ -12,6 +12,7 @@ from functools import cache
 import numpy as np
 
 from haltere._jit import constant
+from haltere.filter.signatures import BANK_COLUMNS, SLOTS
 
 __all__ = [
     "AID_STATE",
@@ -28,6 +29,7 @@ __all__ = [
     "POS",
     "REST",
     "STAGE",
+    "STEP_RING",
     "THETA",
     "VEL",
     "layout",
@@ -46,6 +48,8 @@ MEASUREMENT_CAPACITY = 128
 EVENT_CAPACITY = 32
 #: Tenths of a second that the compass watch looks back, in a plain number: it is a modulus.
 COMPASS_BINS = constant(128)
+#: Raw IMU samples that the search for steps looks back, likewise.
+STEP_RING = constant(16)
 
 
 def _record(*fields: tuple[object, ...]) -> np.dtype[np.void]:
@@ -200,7 +204,73 @@ MOTORS = _record(
 )
 
 #: ``onset`` and ``threshold`` where there is one, else the time itself and NaN.
-EVENT = _record(("t", "f8"), ("onset", "f8"), ("code", "i8"), ("sensor", "i8"), ("value", "f8"), ("threshold", "f8"), ("detail", "i8"))
+EVENT = _record(
+    ("t", "f8"),
+    ("onset", "f8"),
+    ("code", "i8"),
+    ("sensor", "i8"),
+    ("value", "f8"),
+    ("threshold", "f8"),
+    ("detail", "i8"),
+    ("seen", "f8"),  # of a fault that was named: when it was first seen [s], its size with 1 sigma, what else it may be, bit by bit
+    ("size", "f8"),
+    ("sd", "f8"),
+    ("candidates", "i8"),
+)
+
+#: What `haltere.diagnosis.steps` remembers of the raw samples: six channels, gyro and then accelerometer.
+STEPS = _record(
+    ("head", "i8"),
+    ("filled", "i8"),
+    ("u", "f8", (int(STEP_RING), 6)),
+    ("when", "f8", int(STEP_RING)),
+    ("square", "f8", 6),  # mean square of a difference over two samples
+    ("held", "f8", 6),  # the last value, how often it has come, the longest such run before, the largest size before
+    ("run", "i8", 6),
+    ("t_run", "f8", 6),
+    ("longest", "i8", 6),
+    ("peak", "f8", 6),
+    ("quick", "f8", 6),  # mean square of second differences, lately and in the flight
+    ("slow", "f8", 6),
+    ("t_rough", "f8", 6),  # since when it is rough, and what is wrong with the channel: 0 nothing
+    ("wrong", "i8", 6),
+    ("rate", "f8", 3),  # mean square of the rate in flight [rad^2/s^2]
+    ("force", "f8", 3),
+    ("n", "i8"),
+)
+
+#: Part of Φ since the last fusion, see `haltere.filter.signatures.move`.
+_TRANSITION = _record(("P", "f8", (CORE, CORE)))
+
+
+def _bank(n: int) -> np.dtype[np.void]:
+    """What `haltere.diagnosis` remembers of ``n`` error states: responses to unit faults, a column each, and how they match."""
+    return _record(
+        ("x", "f8", (n, BANK_COLUMNS)),
+        ("e", "f8", BANK_COLUMNS),
+        ("num", "f8", BANK_COLUMNS),
+        ("den", "f8", BANK_COLUMNS),
+        ("live", "i8", int(SLOTS)),
+        ("onset", "f8", int(SLOTS)),
+        ("phi", _TRANSITION),
+        ("span", "f8"),
+        ("last", "f8", 20),  # whitened innovation before, by component
+        ("fresh", "i8"),  # evidence has come since the last judgement
+        ("t_slot", "f8"),
+        ("t_judge", "f8"),
+        ("n_aligned", "i8"),
+        ("yaw", "f8"),  # ``yaw_corrected`` as it was
+        ("level", "f8", 14),  # by family: largest statistic, its fault and slot
+        ("fault", "i8", 14),
+        ("slot", "i8", 14),
+        ("alarm", "i8"),  # 1: seen, 2: told as a set
+        ("t_seen", "f8"),
+        ("slope", "f8", 6),  # of a ramp that was named, by axis, until when
+        ("t_slope", "f8", 6),
+        ("healed", "i8"),
+        ("step", STEPS),
+    )
+
 
 #: A first stage: the part of a state that prediction and updates touch, with the core states only.
 STAGE = _record(
@@ -211,6 +281,7 @@ STAGE = _record(
     ("ba", "f8", 3),
     ("baro", "f8", (0,)),
     ("mag", "f8", (0,)),
+    ("bank", _bank(CORE), (0,)),
     ("P", "f8", (CORE, CORE)),
     ("dx", "f8", CORE),
     ("u", "f8", CORE),
@@ -243,6 +314,7 @@ PARAMETERS = np.dtype(
             "two_stage_tolerance two_stage_k1 two_stage_k2 two_stage_robust two_stage_index two_stage_innovation "
             "two_stage_radial two_stage_memory "
             "two_stage_haversine two_stage_height_sign "
+            "diagnosis_inertial diagnosis_gyro diagnosis_accel diagnosis_threshold "
             "imu_mean horizon covariance_interval"
         ).split()
     ],
@@ -251,7 +323,7 @@ PARAMETERS = np.dtype(
 
 
 @cache
-def layout(baro: int = 0, mag: int = 0, stages: int = 0) -> np.dtype[np.void]:
+def layout(baro: int = 0, mag: int = 0, stages: int = 0, banks: int = 0) -> np.dtype[np.void]:
     """State record type.
 
     Parameters
@@ -262,6 +334,8 @@ def layout(baro: int = 0, mag: int = 0, stages: int = 0) -> np.dtype[np.void]:
         3 with the offset of the magnetometer as states, else 0.
     stages
         1 with a first stage beside the main state (`two-stage`), else 0.
+    banks
+        1 with the memory of diagnosis, else 0.
 
     Returns
     -------
@@ -324,6 +398,7 @@ def layout(baro: int = 0, mag: int = 0, stages: int = 0) -> np.dtype[np.void]:
             ("imu_n", "i8"),
             ("imu", IMU_SAMPLE, (IMU_CAPACITY,)),
             ("a", STAGE, (stages,)),
+            ("bank", _bank(n), (banks,)),
             ("ring_head", "i8", 5),
             ("ring_n", "i8", 5),
             ("ring", MEASUREMENT, (5, MEASUREMENT_CAPACITY)),

@@ -121,8 +121,8 @@ def turn(s: Any) -> None:
 
 
 @jit
-def predict(s: Any, prm: Any, w: Vec, f: Vec, rotation: Vec, dv_mid: Vec, dt: float) -> None:
-    """Advance nominal state and covariance by one interval (theory-amendments.md §8).
+def predict(s: Any, prm: Any, w: Vec, f: Vec, rotation: Vec, dv_mid: Vec, dt: float) -> tuple[Mat, Mat, Mat]:
+    """Advance nominal state and covariance by one interval (theory-amendments.md §8); return the blocks of Φ, see `transition`.
 
     Parameters
     ----------
@@ -139,6 +139,7 @@ def predict(s: Any, prm: Any, w: Vec, f: Vec, rotation: Vec, dv_mid: Vec, dt: fl
     s.w[0], s.w[1], s.w[2] = w
     D, A, B = transition(C, rotation, f, dt)
     propagate(s, prm, C, D, A, B, dt)
+    return D, A, B
 
 
 @jit

@@ -1,0 +1,56 @@
+"""What diagnosis found, as the events that a reader sees: sensor, axis, kind, size, candidates, evidence in words. It decides nothing."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+
+from haltere.diagnosis.inertial import FAMILIES
+
+__all__ = ["findings"]
+
+#: Kind, unit and its factor of every signature, by groups of three; then compass and barometer.
+_KINDS = (
+    ("bias", "deg/s", math.degrees(1.0)),
+    ("bias", "m/s²", 1.0),
+    ("ramp", "deg/s per s", math.degrees(1.0)),
+    ("ramp", "m/s² per s", 1.0),
+    ("bias", "m/s", 1.0),
+    ("bias", "m", 1.0),
+)
+_LAST = (("disturb", "deg", math.degrees(1.0)), ("bias", "m", 1.0))
+
+
+def _of(fault: int) -> tuple[int, tuple[str, str, float]]:
+    """Family of a signature, and its kind, unit and factor."""
+    family = fault - 6 if fault >= 6 else fault
+    return family, _KINDS[fault // 3] if fault < 18 else _LAST[fault - 18]
+
+
+def findings(kind: str, record: np.void, events: list[dict[str, Any]]) -> None:
+    """Append a finding to the events, or complete the one that told of it before as one of several."""
+    family, (fault, unit, factor) = _of(int(record["detail"]))
+    sensor, _, axis = FAMILIES[family].partition(".")
+    named = [name for g, name in enumerate(FAMILIES) if int(record["candidates"]) >> g & 1]
+    candidates = sorted(set(named), key=named.index)
+    size, sd = float(record["size"]) * factor, float(record["sd"]) * factor
+    what = {6: "velocity ", 7: "velocity ", 8: "velocity ", 9: "position ", 10: "position ", 11: "position "}.get(family, "")
+    evidence = f"{what}{size:+.3g} ± {sd:.2g} {unit} explains the innovations since {float(record['onset']):.2f} s"
+    isolated = kind == "fault"
+    if isolated:
+        done = "its effect was taken back" if sensor in ("gyro", "accel", "barometer") else "its effect was taken back; it is not heard"
+        evidence += f"; {done}"
+    else:
+        evidence += f"; so may {' or '.join(c for c in candidates if c != FAMILIES[family])}"
+    out = {
+        "sensor": sensor, "axis": axis or None, "kind": fault, "t_onset": float(record["onset"]), "t_detected": float(record["seen"]),
+        "t_isolated": float(record["t"]) if isolated else None, "t_recovered": None, "candidates": candidates,
+        "statistic": float(record["value"]), "threshold": float(record["threshold"]), "evidence": evidence,
+    }  # fmt: skip
+    before = events[-1] if events else None
+    if isolated and before is not None and before["t_isolated"] is None and before["t_detected"] == out["t_detected"]:
+        events[-1] = out
+    else:
+        events.append(out)

@@ -1,0 +1,287 @@
+"""Faults of one IMU without a vehicle model: onsets are opened, the bank of signatures is judged, a fault is named and its effect undone.
+
+The statistic of a fault is the largest of its onsets (theory-amendments.md §3). An alarm is a statistic above its threshold; a name is one
+that exceeds every other by a margin, until when the verdict is the set within that margin. What a named fault has put into the state is
+known, size times response, and is taken back; the failed axis is open again by the uncertainty of its size. The onsets kept are 0.25 s
+apart at first and further the longer they are ago, about a seventh of that time: those of ramps lie many seconds back.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+from haltere._jit import constant, jit
+from haltere.aids import compass
+from haltere.aids.fusing import DISTRUSTED, RUNNING
+from haltere.aids.record import E_FAULT, E_SUSPECT, GNSS_POSITION, GNSS_VELOCITY, NO_SENSOR, event_since
+from haltere.core.rotation import Mat
+from haltere.filter.signatures import (
+    ACCEL,
+    ACCEL_RAMP,
+    BAROMETER_OFFSET,
+    GYRO,
+    GYRO_RAMP,
+    HEADING,
+    N_FAULTS,
+    POSITION,
+    SLOTS,
+    VELOCITY,
+    clear,
+    move,
+    open_slot,
+)
+from haltere.strapdown.propagate import inject, left_F
+
+__all__ = ["FAMILIES", "N_FAMILIES", "carry", "heal", "judge", "tick"]
+
+#: What faults are told apart: gyro and accelerometer axes, GNSS velocity and position, compass, barometer.
+FAMILIES = (
+    "gyro.x", "gyro.y", "gyro.z", "accel.x", "accel.y", "accel.z", "gnss.n", "gnss.e", "gnss.d", "gnss.n", "gnss.e", "gnss.d",
+    "magnetometer", "barometer",
+)  # fmt: skip
+N_FAMILIES = constant(14)
+F_ACCEL, F_VELOCITY, F_POSITION, F_COMPASS, F_BAROMETER = (constant(i) for i in (3, 6, 9, 12, 13))
+NONE = constant(-1)
+#: Spacing of new onsets, how old the oldest may be, time between judgements, and how long a set is kept for itself [s].
+GRID, OLDEST, EVERY, TELL = 0.25, 15.0, 0.1, 2.5
+#: By how much a name must exceed the others; and for an axis of the gyro against that of the accelerometer which looks most like it.
+MARGIN, MARGIN_ALIKE = 9.0, 16.0
+#: Changes that are no fault: slopes, as those of a bias over so long [s]; GNSS velocity [m/s], position [m], heading [rad], height [m].
+RAMP_TIME, VELOCITY_FREE, POSITION_FREE, HEADING_FREE, HEIGHT_FREE = 10.0, 0.3, 1.5, 0.1, 1.0
+#: Steepest ramps [rad/s^2, m/s^3].
+GYRO_STEEPEST, ACCEL_STEEPEST = math.radians(0.3), 0.12
+#: Factor on the threshold of what is no inertial sensor: its errors last longer than a filter believes.
+OTHERS = 2.0
+#: Least information on a size, in 1/(unit)^2, and the part of a size that its onset and linearity leave open, 1 sigma.
+LEAST, LEFT = 1.0, 0.1
+#: From this uncertainty of attitude on the bank listens: 1 sigma of tilt and of yaw [rad].
+TILT_KNOWN, YAW_KNOWN = math.radians(5.0), math.radians(25.0)
+#: A ramp that was named is followed for so long; its bias then walks as fast as it goes in about this time [s].
+FOLLOWED, LAG = 10.0, 2.0
+
+
+@jit
+def carry(s: Any, D: Mat, A: Mat, B: Mat, dt: float) -> None:
+    """Take one interval of prediction, with its blocks of Φ, into that since the last fusion."""
+    b = s.bank[0]
+    for j in range(15):
+        left_F(b.phi, j, D, A, B, dt)
+    for a in range(3):
+        b.phi.P[9 + a, 9 + a] += dt
+        b.phi.P[12 + a, 12 + a] += dt
+    b.span += dt
+
+
+@jit
+def family_of(fault: int) -> int:
+    """Family of a signature: a ramp is of its axis."""
+    return fault - 6 if fault >= GYRO_RAMP else fault
+
+
+@jit
+def free(prm: Any, fault: int) -> float:
+    """Size that is no fault."""
+    if fault < ACCEL:
+        return float(prm.diagnosis_gyro)
+    if fault < GYRO_RAMP:
+        return float(prm.diagnosis_accel)
+    if fault < ACCEL_RAMP:
+        return float(prm.diagnosis_gyro / RAMP_TIME)
+    if fault < VELOCITY:
+        return float(prm.diagnosis_accel / RAMP_TIME)
+    if fault < POSITION:
+        return VELOCITY_FREE
+    if fault < HEADING:
+        return POSITION_FREE
+    return HEADING_FREE if fault < BAROMETER_OFFSET else HEIGHT_FREE
+
+
+@jit
+def most(fault: int) -> float:
+    """Size beyond which a ramp is none: in hover a ramp of an accelerometer looks like a step of the gyro, g times as steep."""
+    if fault >= GYRO_RAMP and fault < VELOCITY:
+        return GYRO_STEEPEST if fault < ACCEL_RAMP else ACCEL_STEEPEST
+    return 1e9
+
+
+@jit
+def next_slot(b: Any, t: float) -> int:
+    """A slot for an onset now: one that is free or too old, else the one that is missed least, its neighbours' distance over its age."""
+    best, least = 0, 1e18
+    for k in range(len(b.live)):
+        age = t - b.onset[k]
+        if b.live[k] == 0 or age > OLDEST:
+            return k
+        before, after = 1e18, 1e18
+        for i in range(len(b.live)):
+            gap = b.onset[i] - b.onset[k]
+            if gap > 0.0:
+                after = min(after, gap)
+            elif i != k:
+                before = min(before, -gap)
+        if before < 1e18 and (before + after) / age < least and age > 2.5 * GRID:
+            best, least = k, (before + after) / age
+    return best
+
+
+@jit
+def known(s: Any) -> bool:
+    """Whether the attitude is known well enough for linear responses."""
+    return compass.tilt_variance(s) < TILT_KNOWN * TILT_KNOWN and compass.yaw_sd(s) < YAW_KNOWN
+
+
+@jit
+def tick(s: Any, prm: Any, dt: float) -> bool:
+    """After fusion: open onsets, judge; True when a named fault has changed the state beyond what its measurements did."""
+    b = s.bank[0]
+    follow(s, dt)
+    if b.n_aligned != s.n_aligned or abs(s.yaw_corrected - b.yaw) > 0.5:
+        clear(b)
+        b.n_aligned, b.t_slot, b.t_judge = s.n_aligned, s.t, s.t
+        for a in range(len(b.slope)):
+            b.slope[a] = 0.0
+    b.yaw = s.yaw_corrected
+    if s.t >= b.t_slot:
+        b.t_slot = s.t + GRID - 1e-6
+        if known(s):
+            if b.span > 0.0:
+                move(b)
+            open_slot(b, next_slot(b, s.t), s.t)
+        else:
+            clear(b)
+    if b.fresh == 1 and s.t >= b.t_judge:
+        b.t_judge = s.t + EVERY - 1e-6
+        b.fresh = 0
+        return judge(s, prm)
+    return False
+
+
+@jit
+def follow(s: Any, dt: float) -> None:
+    """Let the bias of an axis whose ramp was named walk as fast as it was found to go."""
+    b = s.bank[0]
+    for a in range(len(b.slope)):
+        if b.slope[a] != 0.0:
+            if s.t > b.t_slope[a]:
+                b.slope[a] = 0.0
+            s.P[9 + a, 9 + a] += b.slope[a] * b.slope[a] * LAG * dt
+
+
+@jit
+def weigh(s: Any, prm: Any) -> tuple[int, int, float]:
+    """Statistic of every family; the one furthest above its threshold, the largest of all, and that ratio."""
+    b = s.bank[0]
+    for g in range(N_FAMILIES):
+        b.level[g], b.fault[g], b.slot[g] = 0.0, NONE, 0
+    alarm, ratio = NONE, 0.0
+    for f in range(N_FAULTS):
+        g = family_of(f)
+        tolerance, largest = free(prm, f), most(f)
+        h = prm.diagnosis_threshold * (1.0 if g < F_VELOCITY else OTHERS)
+        for k in range(SLOTS):
+            j = f * SLOTS + k
+            den = b.den[j]
+            num = abs(b.num[j])
+            if den > LEAST and num > tolerance * den:
+                size = min(num / den, largest)
+                level = size * (2.0 * num - size * den)  # twice the gain in log likelihood; num²/den where the size is free
+                if level > b.level[g]:
+                    b.level[g], b.fault[g], b.slot[g] = level, f, k
+                beyond = (level - tolerance * (2.0 * num - tolerance * den)) / h
+                if beyond > ratio:
+                    alarm, ratio = g, beyond
+    lead = 0
+    for g in range(N_FAMILIES):
+        if b.level[g] > b.level[lead]:
+            lead = g
+    return alarm, lead, ratio
+
+
+@jit
+def alike(g: int, o: int) -> bool:
+    """Whether an axis of the gyro and one of the accelerometer look alike in hover: x and y, y and x."""
+    low, high = min(g, o), max(g, o)
+    return (low == 0 and high == F_ACCEL + 1) or (low == 1 and high == F_ACCEL)
+
+
+@jit
+def judge(s: Any, prm: Any) -> bool:
+    """Alarm, set or name from the bank as it stands; True when the state was changed."""
+    b = s.bank[0]
+    alarm, lead, ratio = weigh(s, prm)
+    if ratio < 1.0:
+        if b.alarm != 0 and ratio < 0.5:
+            b.alarm = 0
+        return False
+    if b.alarm == 0:
+        b.alarm, b.t_seen = 1, s.t
+    candidates, others = 1 << lead, 0
+    for g in range(N_FAMILIES):
+        if g != lead and b.level[lead] - b.level[g] < (MARGIN_ALIKE if alike(g, lead) else MARGIN):
+            candidates |= 1 << g
+            others += 1
+    if others == 0 and alarm == lead:
+        return name(s, prm, lead)
+    if b.alarm == 1 and s.t - b.t_seen > TELL:
+        b.alarm = 2
+        if lead < F_VELOCITY:
+            tell(s, prm, E_SUSPECT, lead, candidates)
+    return False
+
+
+@jit
+def tell(s: Any, prm: Any, code: Any, g: int, candidates: int) -> None:
+    """Leave an event of the family ``g`` as the bank has it."""
+    b = s.bank[0]
+    f, k = b.fault[g], b.slot[g]
+    j = f * SLOTS + k
+    n = s.n_events
+    threshold = prm.diagnosis_threshold * (1.0 if g < F_VELOCITY else OTHERS)
+    event_since(s, s.t, b.onset[k], code, NO_SENSOR, b.level[g], threshold, f)
+    if s.n_events > n:
+        e = s.event[n]
+        e.seen, e.size, e.sd, e.candidates = b.t_seen, b.num[j] / b.den[j], 1.0 / math.sqrt(b.den[j]), candidates
+
+
+@jit
+def name(s: Any, prm: Any, g: int) -> bool:
+    """A fault stands alone: say so, take its effect back, and begin anew."""
+    b = s.bank[0]
+    f, k = b.fault[g], b.slot[g]
+    if g == F_COMPASS:  # the compass has a watch of its own
+        b.alarm = 0
+        return False
+    tell(s, prm, E_FAULT, g, 1 << g)
+    heal(s, f, k)
+    if g >= F_VELOCITY and g < F_COMPASS:
+        sensor = GNSS_VELOCITY if g < F_POSITION else GNSS_POSITION
+        other = GNSS_POSITION if g < F_POSITION else GNSS_VELOCITY
+        if s.aid[other].started == RUNNING:
+            s.aid[sensor].started = DISTRUSTED
+            s.aid[sensor].t_due = s.t
+    if g < F_ACCEL:
+        compass.forget(s)
+    clear(b)
+    return True
+
+
+@jit
+def heal(s: Any, f: int, k: int) -> None:
+    """Take back what fault ``f`` since the onset of slot ``k`` has put into the state: x̂ <- x̂ + b̂ x, P <- P + σ² x xᵀ."""
+    b = s.bank[0]
+    j = f * SLOTS + k
+    size = b.num[j] / b.den[j]
+    variance = 1.0 / b.den[j] + LEFT * LEFT * size * size
+    n = s.P.shape[0]
+    for i in range(n):
+        s.dx[i] = size * b.x[i, j]
+    for i in range(n):
+        for c in range(n):
+            s.P[i, c] += variance * b.x[i, j] * b.x[c, j]
+    inject(s)
+    b.healed += 1
+    if f >= GYRO_RAMP and f < VELOCITY:
+        a = f - GYRO_RAMP
+        b.slope[a], b.t_slope[a] = abs(size), s.t + FOLLOWED
+    b.yaw = s.yaw_corrected
