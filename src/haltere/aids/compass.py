@@ -268,6 +268,8 @@ def close_bin(s: Any, prm: Any) -> None:
     c.n, c.total = 0, 0.0
     if c.out == 0:
         difference, bound, begin = compare(s, prm)
+        if len(s.bank) > 0 and s.bank[0].ratio > 0.35:
+            return  # diagnosis is about to find what is wrong: a tilt turns the levelled heading, too
         if abs(difference) > bound:
             put_out(s, prm, onset(c, difference, begin), OUT_TURN, difference, bound)
         elif abs(c.slow) > apart(s, prm):

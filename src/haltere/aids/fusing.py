@@ -172,7 +172,7 @@ def fuse_offer(s: Any, aids: Any, t: float, sensor: int, offer: Offer) -> None:
                     matched(s, row, variance_i, e_i, component + i, sensor <= MAGNETOMETER and component != C_MAG, True)
                 apply(s, row, r_i, e_i)
         inject(s)
-    elif len(s.bank) > 0 and reason == R_INNOVATION and sensor <= MAGNETOMETER and component != C_MAG:
+    elif len(s.bank) > 0 and reason == R_INNOVATION and s.aid[sensor].started != DISTRUSTED and sensor <= MAGNETOMETER and component != C_MAG:
         for i in range(n):  # what the filter refuses is evidence all the same
             row = H0 if i == 0 else (H1 if i == 1 else H2)
             if z[i] == z[i]:

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from haltere.diagnosis.inertial import FAMILIES
+from haltere.diagnosis.steps import DEATHS, STEP
 
 __all__ = ["findings"]
 
@@ -31,6 +32,9 @@ def _of(fault: int) -> tuple[int, tuple[str, str, float]]:
 
 def findings(kind: str, record: np.void, events: list[dict[str, Any]]) -> None:
     """Append a finding to the events, or complete the one that told of it before as one of several."""
+    if int(record["detail"]) >= STEP:
+        _of_samples(kind, record, events)
+        return
     family, (fault, unit, factor) = _of(int(record["detail"]))
     sensor, _, axis = FAMILIES[family].partition(".")
     named = [name for g, name in enumerate(FAMILIES) if int(record["candidates"]) >> g & 1]
@@ -54,3 +58,34 @@ def findings(kind: str, record: np.void, events: list[dict[str, Any]]) -> None:
         events[-1] = out
     else:
         events.append(out)
+
+
+def _of_samples(kind: str, record: np.void, events: list[dict[str, Any]]) -> None:
+    """What the raw samples show by themselves."""
+    detail, t, onset = int(record["detail"]), float(record["t"]), float(record["onset"])
+    code = STEP + 6 * ((detail - STEP) // 6)
+    channel = detail - code
+    sensor, axis = ("gyro", "accel")[channel // 3], "xyz"[channel % 3]
+    fault = next((word for word, c in DEATHS.items() if c == code), "bias")
+    if kind == "over":
+        for e in reversed(events):
+            if (e["sensor"], e["axis"], e["kind"]) == (sensor, axis, fault) and e["t_recovered"] is None:
+                e["t_recovered"] = t
+                e["evidence"] += f"; works again at {t:.2f} s"
+                return
+        return
+    size, sd = math.degrees(float(record["size"])), math.degrees(float(record["sd"]))
+    evidence = {
+        "bias": f"the rate steps by {size:+.3g} ± {sd:.2g} deg/s between two samples, which no torque does; its effect was taken back",
+        "stuck": "the value does not change",
+        "dropout": "the value is zero",
+        "saturate": "the value stays at the largest of the flight",
+        "noise": f"{math.sqrt(max(float(record['value']), 0.0)):.1f} times as rough as in the flight so far, and the other axes are not",
+    }[fault]
+    if fault != "bias":
+        evidence += "; attitude and velocity are held as unsure as that leaves them"
+    events.append({
+        "sensor": sensor, "axis": axis, "kind": fault, "t_onset": onset, "t_detected": t, "t_isolated": t, "t_recovered": None,
+        "candidates": [f"{sensor}.{axis}"], "statistic": float(record["value"]), "threshold": float(record["threshold"]),
+        "evidence": evidence,
+    })  # fmt: skip

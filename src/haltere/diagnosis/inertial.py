@@ -31,6 +31,8 @@ from haltere.filter.signatures import (
     move,
     open_slot,
 )
+from haltere.diagnosis import steps
+from haltere.diagnosis.steps import refuted, shown
 from haltere.strapdown.propagate import inject, left_F
 
 __all__ = ["FAMILIES", "N_FAMILIES", "carry", "heal", "judge", "tick"]
@@ -47,9 +49,12 @@ NONE = constant(-1)
 GRID, OLDEST, EVERY, TELL = 0.25, 15.0, 0.1, 2.5
 #: By how much a name must exceed the others; and for an axis of the gyro against that of the accelerometer which looks most like it.
 MARGIN, MARGIN_ALIKE = 9.0, 16.0
+#: Margin where the raw samples show the step; and as a part of the statistic, since responses are linear and onsets on a grid.
+SEEN, LINEAR = 2.0, 0.02
 #: Changes that are no fault: slopes, as those of a bias over so long [s]; GNSS velocity [m/s], position [m], heading [rad], height [m].
-RAMP_TIME, VELOCITY_FREE, POSITION_FREE, HEADING_FREE, HEIGHT_FREE = 10.0, 0.3, 1.5, 0.1, 1.0
-#: Steepest ramps [rad/s^2, m/s^3].
+RAMP_TIME, VELOCITY_FREE, POSITION_FREE, HEADING_FREE, HEIGHT_FREE = 30.0, 0.3, 1.5, 0.1, 1.0
+#: Largest steps [rad/s, m/s^2], steepest ramps [rad/s^2, m/s^3].
+GYRO_MOST, ACCEL_MOST = 1.0, 8.0
 GYRO_STEEPEST, ACCEL_STEEPEST = math.radians(0.3), 0.12
 #: Factor on the threshold of what is no inertial sensor: its errors last longer than a filter believes.
 OTHERS = 2.0
@@ -99,8 +104,10 @@ def free(prm: Any, fault: int) -> float:
 
 @jit
 def most(fault: int) -> float:
-    """Size beyond which a ramp is none: in hover a ramp of an accelerometer looks like a step of the gyro, g times as steep."""
-    if fault >= GYRO_RAMP and fault < VELOCITY:
+    """Size that no fault has; for a ramp, since hover one of an accelerometer looks like a step of the gyro, g times as steep."""
+    if fault < GYRO_RAMP:
+        return GYRO_MOST if fault < ACCEL else ACCEL_MOST
+    if fault < VELOCITY:
         return GYRO_STEEPEST if fault < ACCEL_RAMP else ACCEL_STEEPEST
     return 1e9
 
@@ -132,19 +139,30 @@ def known(s: Any) -> bool:
 
 
 @jit
+def sick(b: Any) -> bool:
+    """Whether a channel of the IMU is known to fail: then the bank has nothing to say."""
+    for c in range(6):
+        if b.step.wrong[c] != 0:
+            return True
+    return False
+
+
+@jit
 def tick(s: Any, prm: Any, dt: float) -> bool:
     """After fusion: open onsets, judge; True when a named fault has changed the state beyond what its measurements did."""
     b = s.bank[0]
     follow(s, dt)
     if b.n_aligned != s.n_aligned or abs(s.yaw_corrected - b.yaw) > 0.5:
         clear(b)
+        if b.n_aligned != s.n_aligned:
+            steps.forget(b)
         b.n_aligned, b.t_slot, b.t_judge = s.n_aligned, s.t, s.t
         for a in range(len(b.slope)):
             b.slope[a] = 0.0
     b.yaw = s.yaw_corrected
     if s.t >= b.t_slot:
         b.t_slot = s.t + GRID - 1e-6
-        if known(s):
+        if known(s) and not sick(b):
             if b.span > 0.0:
                 move(b)
             open_slot(b, next_slot(b, s.t), s.t)
@@ -169,47 +187,65 @@ def follow(s: Any, dt: float) -> None:
 
 
 @jit
-def weigh(s: Any, prm: Any) -> tuple[int, int, float]:
-    """Statistic of every family; the one furthest above its threshold, the largest of all, and that ratio."""
+def weigh(s: Any, prm: Any) -> tuple[int, float]:
+    """Statistic of every family: which is the largest, and the largest ratio of one to its threshold, tolerances left out."""
     b = s.bank[0]
     for g in range(N_FAMILIES):
         b.level[g], b.fault[g], b.slot[g] = 0.0, NONE, 0
-    alarm, ratio = NONE, 0.0
+    b.ratio, ratio, tilting = 0.0, 0.0, 0.0
     for f in range(N_FAULTS):
         g = family_of(f)
-        tolerance, largest = free(prm, f), most(f)
+        tolerance, largest, least = free(prm, f), most(f), 0.25 * prm.diagnosis_threshold
         h = prm.diagnosis_threshold * (1.0 if g < F_VELOCITY else OTHERS)
         for k in range(SLOTS):
             j = f * SLOTS + k
+            span = GRID + 0.2 * (s.t - b.onset[k])
             den = b.den[j]
             num = abs(b.num[j])
             if den > LEAST and num > tolerance * den:
                 size = min(num / den, largest)
                 level = size * (2.0 * num - size * den)  # twice the gain in log likelihood; num²/den where the size is free
+                if f < GYRO_RAMP and level > least and refuted(b, f, math.copysign(size, b.num[j]), b.onset[k] - span, b.onset[k] + span):
+                    continue
                 if level > b.level[g]:
                     b.level[g], b.fault[g], b.slot[g] = level, f, k
                 beyond = (level - tolerance * (2.0 * num - tolerance * den)) / h
-                if beyond > ratio:
-                    alarm, ratio = g, beyond
+                ratio = max(ratio, beyond)
+                if g < F_VELOCITY and g != 2 and beyond > b.ratio:
+                    b.ratio, tilting = beyond, level
+    if tilting < b.level[F_COMPASS]:
+        b.ratio = 0.0
     lead = 0
     for g in range(N_FAMILIES):
         if b.level[g] > b.level[lead]:
             lead = g
-    return alarm, lead, ratio
+    return lead, ratio
 
 
 @jit
 def alike(g: int, o: int) -> bool:
-    """Whether an axis of the gyro and one of the accelerometer look alike in hover: x and y, y and x."""
+    """Whether two axes look alike in hover: gyro x and accelerometer y, gyro y and accelerometer x; tilted into a wind, gyro z and both."""
     low, high = min(g, o), max(g, o)
-    return (low == 0 and high == F_ACCEL + 1) or (low == 1 and high == F_ACCEL)
+    return (low == 0 and high == F_ACCEL + 1) or (low == 1 and high == F_ACCEL) or high == 2 or (low == 2 and high < F_ACCEL + 2)
+
+
+@jit
+def in_samples(s: Any, g: int) -> bool:
+    """Whether the raw samples show the step of a gyro axis that the bank believes in."""
+    b = s.bank[0]
+    f, k = b.fault[g], b.slot[g]
+    if f < GYRO or f >= ACCEL:
+        return False
+    j = f * SLOTS + k
+    span = GRID + 0.2 * (s.t - b.onset[k])
+    return shown(b, f, b.num[j] / b.den[j], b.onset[k] - span, b.onset[k] + span)
 
 
 @jit
 def judge(s: Any, prm: Any) -> bool:
     """Alarm, set or name from the bank as it stands; True when the state was changed."""
     b = s.bank[0]
-    alarm, lead, ratio = weigh(s, prm)
+    lead, ratio = weigh(s, prm)
     if ratio < 1.0:
         if b.alarm != 0 and ratio < 0.5:
             b.alarm = 0
@@ -217,11 +253,14 @@ def judge(s: Any, prm: Any) -> bool:
     if b.alarm == 0:
         b.alarm, b.t_seen = 1, s.t
     candidates, others = 1 << lead, 0
+    top = b.level[lead]
+    seen = in_samples(s, lead)
     for g in range(N_FAMILIES):
-        if g != lead and b.level[lead] - b.level[g] < (MARGIN_ALIKE if alike(g, lead) else MARGIN):
+        margin = SEEN if seen and not in_samples(s, g) else max(MARGIN_ALIKE if alike(g, lead) else MARGIN, LINEAR * top)
+        if g != lead and top - b.level[g] < margin:
             candidates |= 1 << g
             others += 1
-    if others == 0 and alarm == lead:
+    if others == 0 and top > prm.diagnosis_threshold * (1.0 if lead < F_VELOCITY else OTHERS):
         return name(s, prm, lead)
     if b.alarm == 1 and s.t - b.t_seen > TELL:
         b.alarm = 2
@@ -260,8 +299,8 @@ def name(s: Any, prm: Any, g: int) -> bool:
         if s.aid[other].started == RUNNING:
             s.aid[sensor].started = DISTRUSTED
             s.aid[sensor].t_due = s.t
-    if g < F_ACCEL:
-        compass.forget(s)
+    if g < F_VELOCITY:
+        compass.forget(s)  # a tilt that was mended has turned the levelled heading
     clear(b)
     return True
 

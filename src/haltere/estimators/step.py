@@ -21,7 +21,7 @@ from haltere.aids.record import (
     event,
 )
 from haltere.core.rotation import Vec, cross, dcm, mat_vec, quat_from_rotvec, quat_mul
-from haltere.diagnosis import inertial
+from haltere.diagnosis import inertial, steps
 from haltere.estimators import alignment, yaw_bank
 from haltere.filter.queue import pop_imu, push, push_imu
 from haltere.strapdown.propagate import predict
@@ -307,8 +307,10 @@ def advance(s: Any, prm: Any, rows: Any, cov: Any, aids: Any, tape: Any, stage: 
                     s.yaw.fresh = 0
                     if prm.aid_yaw_bank > 0.0:
                         yaw_bank.update(s, s.yaw.z[0], s.yaw.z[1], s.yaw.r)
-        if len(s.bank) > 0 and inertial.tick(s, prm, dt):  # what was before it is smoothed by itself
-            node, kind = True, BEGINS
+        if len(s.bank) > 0:
+            found = steps.watch(s, prm, t, dt, w1, f1)
+            if inertial.tick(s, prm, dt) or found:  # what was before is smoothed by itself
+                node, kind = True, BEGINS
     if t >= s.t_covariance and not sound(s):
         event(s, t, E_DIVERGED, NO_SENSOR, 0.0)
         alignment.begin(s, t)

@@ -29,6 +29,7 @@ __all__ = [
     "POS",
     "REST",
     "STAGE",
+    "STEP_HISTORY",
     "STEP_RING",
     "THETA",
     "VEL",
@@ -50,6 +51,8 @@ EVENT_CAPACITY = 32
 COMPASS_BINS = constant(128)
 #: Raw IMU samples that the search for steps looks back, likewise.
 STEP_RING = constant(16)
+#: Quarters of a second that the extremes of steps are kept.
+STEP_HISTORY = constant(64)
 
 
 def _record(*fields: tuple[object, ...]) -> np.dtype[np.void]:
@@ -224,6 +227,19 @@ STEPS = _record(
     ("filled", "i8"),
     ("u", "f8", (int(STEP_RING), 6)),
     ("when", "f8", int(STEP_RING)),
+    ("after", "f8", 6),  # sums of the two halves, and the step between them [sigma], now and one sample ago
+    ("before", "f8", 6),
+    ("z", "f8", 6),
+    ("z_before", "f8", 6),
+    ("low", "f8", 6),  # extremes of that since the last interval began, and of each interval with its 1 sigma
+    ("high", "f8", 6),
+    ("t_free", "f8"),  # steps are looked for from here on
+    ("t_interval", "f8"),
+    ("h_head", "i8"),
+    ("h_t", "f8", int(STEP_HISTORY)),
+    ("h_low", "f8", (int(STEP_HISTORY), 6)),
+    ("h_high", "f8", (int(STEP_HISTORY), 6)),
+    ("h_sd", "f8", (int(STEP_HISTORY), 6)),
     ("square", "f8", 6),  # mean square of a difference over two samples
     ("held", "f8", 6),  # the last value, how often it has come, the longest such run before, the largest size before
     ("run", "i8", 6),
@@ -235,7 +251,6 @@ STEPS = _record(
     ("t_rough", "f8", 6),  # since when it is rough, and what is wrong with the channel: 0 nothing
     ("wrong", "i8", 6),
     ("rate", "f8", 3),  # mean square of the rate in flight [rad^2/s^2]
-    ("force", "f8", 3),
     ("n", "i8"),
 )
 
@@ -265,6 +280,7 @@ def _bank(n: int) -> np.dtype[np.void]:
         ("slot", "i8", 14),
         ("alarm", "i8"),  # 1: seen, 2: told as a set
         ("t_seen", "f8"),
+        ("ratio", "f8"),  # statistic of what may have tilted the attitude over its threshold, at the last judgement; 0 if a compass explains more
         ("slope", "f8", 6),  # of a ramp that was named, by axis, until when
         ("t_slope", "f8", 6),
         ("healed", "i8"),
