@@ -199,13 +199,13 @@ def weigh(s: Any, prm: Any) -> tuple[int, float]:
         h = prm.diagnosis_threshold * (1.0 if g < F_VELOCITY else OTHERS)
         for k in range(SLOTS):
             j = f * SLOTS + k
-            span = GRID + 0.2 * (s.t - b.onset[k])
             den = b.den[j]
             num = abs(b.num[j])
-            if den > LEAST and num > tolerance * den:
+            if num * num > least * den and den > LEAST and num > tolerance * den:
+                span = GRID + 0.2 * (s.t - b.onset[k])
                 size = min(num / den, largest)
                 level = size * (2.0 * num - size * den)  # twice the gain in log likelihood; num²/den where the size is free
-                if f < GYRO_RAMP and level > least and refuted(b, f, math.copysign(size, b.num[j]), b.onset[k] - span, b.onset[k] + span):
+                if f < GYRO_RAMP and refuted(b, f, math.copysign(size, b.num[j]), b.onset[k] - span, b.onset[k] + span):
                     continue
                 if level > b.level[g]:
                     b.level[g], b.fault[g], b.slot[g] = level, f, k

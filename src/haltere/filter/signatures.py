@@ -44,10 +44,20 @@ N_FAULTS = constant(20)
 #: Onsets that are kept. Column fault * SLOTS + slot of every array of the bank belongs to a fault and an onset.
 SLOTS = constant(20)
 BANK_COLUMNS = int(N_FAULTS * SLOTS)
+#: Columns that are worked on together: what of them is needed stays in the nearest cache.
+WIDTH = constant(80)
+#: Responses are in single precision: a statistic need not be better, and twice as many are worked on at once.
+ZERO, ONE = np.float32(0.0), np.float32(1.0)
 #: A whitened innovation counts up to so many sigma, more by this factor of the one before it: a lone outlier proves nothing.
 ALONE, FOLLOWED = 4.0, 1.2
 #: Components of an innovation that have a signature of their own: six of GNSS, and the heading (see haltere.aids.record).
 N_GNSS, C_HEADING = 6, 7
+
+
+@jit
+def single(a: float, b: float, c: float) -> tuple[np.float32, np.float32, np.float32]:
+    """Three coefficients in the precision of the responses."""
+    return np.float32(a), np.float32(b), np.float32(c)
 
 
 @jit
@@ -105,37 +115,44 @@ def move(b: Any) -> None:
     ``b.phi.P`` holds the columns of Φ that are not zero or one, of attitude, gyro bias and accelerometer bias, and then the integrals of
     the last two over the time at which a bias has been added.
     """
-    x, P, span = b.x, b.phi.P, b.span
-    m = x.shape[1]
-    for i in range(3):  # position, of what attitude and velocity were
-        a0, a1, a2 = P[6 + i, 0], P[6 + i, 1], P[6 + i, 2]
-        g0, g1, g2 = P[6 + i, 3], P[6 + i, 4], P[6 + i, 5]
-        f0, f1, f2 = P[6 + i, 6], P[6 + i, 7], P[6 + i, 8]
-        for j in range(m):
-            x[6 + i, j] += (
-                span * x[3 + i, j]
-                + a0 * x[0, j] + a1 * x[1, j] + a2 * x[2, j]
-                + g0 * x[9, j] + g1 * x[10, j] + g2 * x[11, j]
-                + f0 * x[12, j] + f1 * x[13, j] + f2 * x[14, j]
-            )  # fmt: skip
-    for i in range(3):
-        a0, a1, a2 = P[3 + i, 0], P[3 + i, 1], P[3 + i, 2]
-        g0, g1, g2 = P[3 + i, 3], P[3 + i, 4], P[3 + i, 5]
-        f0, f1, f2 = P[3 + i, 6], P[3 + i, 7], P[3 + i, 8]
-        for j in range(m):
-            x[3 + i, j] += (
-                a0 * x[0, j] + a1 * x[1, j] + a2 * x[2, j]
-                + g0 * x[9, j] + g1 * x[10, j] + g2 * x[11, j]
-                + f0 * x[12, j] + f1 * x[13, j] + f2 * x[14, j]
-            )  # fmt: skip
-    for j in range(m):
-        t0, t1, t2, g0, g1, g2 = x[0, j], x[1, j], x[2, j], x[9, j], x[10, j], x[11, j]
-        x[0, j] = P[0, 0] * t0 + P[0, 1] * t1 + P[0, 2] * t2 + P[0, 3] * g0 + P[0, 4] * g1 + P[0, 5] * g2
-        x[1, j] = P[1, 0] * t0 + P[1, 1] * t1 + P[1, 2] * t2 + P[1, 3] * g0 + P[1, 4] * g1 + P[1, 5] * g2
-        x[2, j] = P[2, 0] * t0 + P[2, 1] * t1 + P[2, 2] * t2 + P[2, 3] * g0 + P[2, 4] * g1 + P[2, 5] * g2
+    x, P = b.x, b.phi.P
+    span = np.float32(b.span)
+    for c in range(0, x.shape[1], WIDTH):
+        for i in range(3):  # position, of what attitude and velocity were
+            a0, a1, a2 = single(P[6 + i, 0], P[6 + i, 1], P[6 + i, 2])
+            g0, g1, g2 = single(P[6 + i, 3], P[6 + i, 4], P[6 + i, 5])
+            f0, f1, f2 = single(P[6 + i, 6], P[6 + i, 7], P[6 + i, 8])
+            for j in range(c, c + WIDTH):
+                x[6 + i, j] += (
+                    span * x[3 + i, j]
+                    + a0 * x[0, j] + a1 * x[1, j] + a2 * x[2, j]
+                    + g0 * x[9, j] + g1 * x[10, j] + g2 * x[11, j]
+                    + f0 * x[12, j] + f1 * x[13, j] + f2 * x[14, j]
+                )  # fmt: skip
+        for i in range(3):
+            a0, a1, a2 = single(P[3 + i, 0], P[3 + i, 1], P[3 + i, 2])
+            g0, g1, g2 = single(P[3 + i, 3], P[3 + i, 4], P[3 + i, 5])
+            f0, f1, f2 = single(P[3 + i, 6], P[3 + i, 7], P[3 + i, 8])
+            for j in range(c, c + WIDTH):
+                x[3 + i, j] += (
+                    a0 * x[0, j] + a1 * x[1, j] + a2 * x[2, j]
+                    + g0 * x[9, j] + g1 * x[10, j] + g2 * x[11, j]
+                    + f0 * x[12, j] + f1 * x[13, j] + f2 * x[14, j]
+                )  # fmt: skip
+        d00, d01, d02 = single(P[0, 0], P[0, 1], P[0, 2])
+        d10, d11, d12 = single(P[1, 0], P[1, 1], P[1, 2])
+        d20, d21, d22 = single(P[2, 0], P[2, 1], P[2, 2])
+        h00, h01, h02 = single(P[0, 3], P[0, 4], P[0, 5])
+        h10, h11, h12 = single(P[1, 3], P[1, 4], P[1, 5])
+        h20, h21, h22 = single(P[2, 3], P[2, 4], P[2, 5])
+        for j in range(c, c + WIDTH):
+            t0, t1, t2, g0, g1, g2 = x[0, j], x[1, j], x[2, j], x[9, j], x[10, j], x[11, j]
+            x[0, j] = d00 * t0 + d01 * t1 + d02 * t2 + h00 * g0 + h01 * g1 + h02 * g2
+            x[1, j] = d10 * t0 + d11 * t1 + d12 * t2 + h10 * g0 + h11 * g1 + h12 * g2
+            x[2, j] = d20 * t0 + d21 * t1 + d22 * t2 + h20 * g0 + h21 * g1 + h22 * g2
     for a in range(3):
         for i in range(15):
-            g, f = P[i, 9 + a], P[i, 12 + a]
+            g, f = np.float32(P[i, 9 + a]), np.float32(P[i, 12 + a])
             for k in range(SLOTS):
                 if b.live[k] == 1:
                     x[i, (GYRO_RAMP + a) * SLOTS + k] += g
@@ -164,18 +181,7 @@ def matched(s: Any, H: Row, S: float, y: float, component: int, evidence: bool, 
     if b.span > 0.0:
         move(b)
     x, e, num, den = b.x, b.e, b.num, b.den
-    m = x.shape[1]
-    for j in range(m):
-        e[j] = 0.0
-    for c, h in H:
-        h0, h1, h2 = h
-        if h0 != 0.0 or h1 != 0.0 or h2 != 0.0:
-            for j in range(m):
-                e[j] += h0 * x[c, j] + h1 * x[c + 1, j] + h2 * x[c + 2, j]
-    own = VELOCITY + component if component < N_GNSS else HEADING
-    if evidence and (component < N_GNSS or component == C_HEADING):
-        for k in range(SLOTS):
-            e[own * SLOTS + k] += 1.0
+    z, weight = 0.0, 0.0
     if evidence:
         sd = math.sqrt(S)
         most = ALONE + FOLLOWED * abs(b.last[component])
@@ -183,13 +189,31 @@ def matched(s: Any, H: Row, S: float, y: float, component: int, evidence: bool, 
         b.last[component] = z
         z /= sd
         weight = 1.0 / S
-        for j in range(m):
-            num[j] += e[j] * z
-            den[j] += weight * e[j] * e[j]
         b.fresh = 1
-    if moved:
-        for i in range(x.shape[0]):
-            k_i = s.k[i]
-            if k_i != 0.0:
-                for j in range(m):
-                    x[i, j] -= k_i * e[j]
+    z4, weight4 = np.float32(z), np.float32(weight)
+    own = -1
+    if evidence and component < N_GNSS:
+        own = (VELOCITY + component) * SLOTS
+    elif evidence and component == C_HEADING:
+        own = HEADING * SLOTS
+    for c in range(0, x.shape[1], WIDTH):
+        for j in range(c, c + WIDTH):
+            e[j] = ZERO
+        for o, h in H:
+            h0, h1, h2 = single(h[0], h[1], h[2])
+            if h0 != 0.0 or h1 != 0.0 or h2 != 0.0:
+                for j in range(c, c + WIDTH):
+                    e[j] += h0 * x[o, j] + h1 * x[o + 1, j] + h2 * x[o + 2, j]
+        if c <= own and own < c + WIDTH:
+            for j in range(own, own + SLOTS):
+                e[j] += ONE
+        if evidence:
+            for j in range(c, c + WIDTH):
+                num[j] += z4 * e[j]
+                den[j] += weight4 * e[j] * e[j]
+        if moved:
+            for i in range(x.shape[0]):
+                k = np.float32(s.k[i])
+                if k != 0.0:
+                    for j in range(c, c + WIDTH):
+                        x[i, j] -= k * e[j]

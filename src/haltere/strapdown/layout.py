@@ -261,10 +261,10 @@ _TRANSITION = _record(("P", "f8", (CORE, CORE)))
 def _bank(n: int) -> np.dtype[np.void]:
     """What `haltere.diagnosis` remembers of ``n`` error states: responses to unit faults, a column each, and how they match."""
     return _record(
-        ("x", "f8", (n, BANK_COLUMNS)),
-        ("e", "f8", BANK_COLUMNS),
-        ("num", "f8", BANK_COLUMNS),
-        ("den", "f8", BANK_COLUMNS),
+        ("x", "f4", (n, BANK_COLUMNS)),
+        ("e", "f4", BANK_COLUMNS),
+        ("num", "f4", BANK_COLUMNS),
+        ("den", "f4", BANK_COLUMNS),
         ("live", "i8", int(SLOTS)),
         ("onset", "f8", int(SLOTS)),
         ("phi", _TRANSITION),
