@@ -21,13 +21,16 @@ _KINDS = (
     ("bias", "m/s", 1.0),
     ("bias", "m", 1.0),
 )
-_LAST = (("disturb", "deg", math.degrees(1.0)), ("bias", "m", 1.0))
+#: A verdict is revised within this time [s].
+REVISED = 10.0
+_LAST = (("disturb", "deg", math.degrees(1.0)), ("bias", "m", 1.0), ("disturb", "deg", math.degrees(1.0)))
 
 
 def _of(fault: int) -> tuple[int, tuple[str, str, float]]:
     """Family of a signature, and its kind, unit and factor."""
-    family = fault - 6 if fault >= 6 else fault
-    return family, _KINDS[fault // 3] if fault < 18 else _LAST[fault - 18]
+    if fault >= 18:
+        return (12, 13, 12)[fault - 18], _LAST[fault - 18]
+    return fault - 6 if fault >= 6 else fault, _KINDS[fault // 3]
 
 
 def findings(kind: str, record: np.void, events: list[dict[str, Any]]) -> None:
@@ -53,11 +56,29 @@ def findings(kind: str, record: np.void, events: list[dict[str, Any]]) -> None:
         "t_isolated": float(record["t"]) if isolated else None, "t_recovered": None, "candidates": candidates,
         "statistic": float(record["value"]), "threshold": float(record["threshold"]), "evidence": evidence,
     }  # fmt: skip
-    before = events[-1] if events else None
-    if isolated and before is not None and before["t_isolated"] is None and before["t_detected"] == out["t_detected"]:
-        events[-1] = out
+    told = next((e for e in reversed(events) if _suspected(e) and set(candidates) & set(e["candidates"])), None)
+    if isolated and told is not None and out["t_isolated"] - told["t_detected"] < REVISED:
+        out["t_detected"] = told["t_detected"]
+        events[events.index(told)] = out
     else:
         events.append(out)
+    if isolated and sensor in ("gyro", "accel"):
+        _revise(events, out)
+
+
+def _suspected(event: dict[str, Any]) -> bool:
+    """Whether an event is one of this module's that is not settled."""
+    return event["t_isolated"] is None and event["sensor"] in ("gyro", "accel") and len(event["candidates"]) > 1
+
+
+def _revise(events: list[dict[str, Any]], named: dict[str, Any]) -> None:
+    """A compass that was said to turn since the gyro or the tilt was at fault: the verdict is that of the fault."""
+    who = f"{named['sensor']}.{named['axis']}"
+    for e in events:
+        late = named["t_isolated"] - e["t_detected"]
+        if (e["sensor"], e["kind"]) == ("magnetometer", "disturb") and e["t_recovered"] is None and 0.0 <= late < REVISED:
+            e["t_isolated"], e["t_recovered"], e["candidates"] = named["t_isolated"], named["t_isolated"], [who]
+            e["evidence"] += f"; revised at {named['t_isolated']:.1f} s: it was {who}, and the compass is heard again"
 
 
 def _of_samples(kind: str, record: np.void, events: list[dict[str, Any]]) -> None:
@@ -84,8 +105,11 @@ def _of_samples(kind: str, record: np.void, events: list[dict[str, Any]]) -> Non
     }[fault]
     if fault != "bias":
         evidence += "; attitude and velocity are held as unsure as that leaves them"
-    events.append({
+    out = {
         "sensor": sensor, "axis": axis, "kind": fault, "t_onset": onset, "t_detected": t, "t_isolated": t, "t_recovered": None,
         "candidates": [f"{sensor}.{axis}"], "statistic": float(record["value"]), "threshold": float(record["threshold"]),
         "evidence": evidence,
-    })  # fmt: skip
+    }  # fmt: skip
+    events.append(out)
+    if fault == "bias":
+        _revise(events, out)

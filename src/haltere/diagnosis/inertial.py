@@ -15,7 +15,7 @@ from haltere._jit import constant, jit
 from haltere.aids import compass
 from haltere.aids.fusing import DISTRUSTED, RUNNING
 from haltere.aids.record import E_FAULT, E_SUSPECT, GNSS_POSITION, GNSS_VELOCITY, NO_SENSOR, event_since
-from haltere.core.rotation import Mat
+from haltere.core.rotation import Mat, dcm
 from haltere.filter.signatures import (
     ACCEL,
     ACCEL_RAMP,
@@ -27,6 +27,7 @@ from haltere.filter.signatures import (
     POSITION,
     SLOTS,
     VELOCITY,
+    YAW,
     clear,
     move,
     open_slot,
@@ -52,12 +53,14 @@ MARGIN, MARGIN_ALIKE = 9.0, 16.0
 #: Margin where the raw samples show the step; and as a part of the statistic, since responses are linear and onsets on a grid.
 SEEN, LINEAR = 2.0, 0.02
 #: Changes that are no fault: slopes, as those of a bias over so long [s]; GNSS velocity [m/s], position [m], heading [rad], height [m].
-RAMP_TIME, VELOCITY_FREE, POSITION_FREE, HEADING_FREE, HEIGHT_FREE = 30.0, 0.3, 1.5, 0.1, 1.0
+RAMP_TIME, VELOCITY_FREE, POSITION_FREE, HEADING_FREE, HEIGHT_FREE = 30.0, 0.7, 1.2, 0.1, 1.0
 #: Largest steps [rad/s, m/s^2], steepest ramps [rad/s^2, m/s^3].
 GYRO_MOST, ACCEL_MOST = 1.0, 8.0
 GYRO_STEEPEST, ACCEL_STEEPEST = math.radians(0.3), 0.12
 #: Factor on the threshold of what is no inertial sensor: its errors last longer than a filter believes.
 OTHERS = 2.0
+#: The threshold is at least so many times the usual maximum of a block [s]; how fast that is learnt, a part each block; its bound.
+BEYOND_USUAL, BLOCK, RISE, FALL, CAP = 2.0, 10.0, 0.6, 0.1, 2.0
 #: Least information on a size, in 1/(unit)^2, and the part of a size that its onset and linearity leave open, 1 sigma.
 LEAST, LEFT = 1.0, 0.1
 #: From this uncertainty of attitude on the bank listens: 1 sigma of tilt and of yaw [rad].
@@ -80,7 +83,9 @@ def carry(s: Any, D: Mat, A: Mat, B: Mat, dt: float) -> None:
 
 @jit
 def family_of(fault: int) -> int:
-    """Family of a signature: a ramp is of its axis."""
+    """Family of a signature: a ramp is of its axis, a wrong yaw of the compass."""
+    if fault == YAW:
+        return F_COMPASS
     return fault - 6 if fault >= GYRO_RAMP else fault
 
 
@@ -98,8 +103,8 @@ def free(prm: Any, fault: int) -> float:
     if fault < POSITION:
         return VELOCITY_FREE
     if fault < HEADING:
-        return POSITION_FREE
-    return HEADING_FREE if fault < BAROMETER_OFFSET else HEIGHT_FREE
+        return POSITION_FREE if fault < POSITION + 2 else 2.0 * POSITION_FREE
+    return HEIGHT_FREE if fault == BAROMETER_OFFSET else HEADING_FREE
 
 
 @jit
@@ -156,6 +161,9 @@ def tick(s: Any, prm: Any, dt: float) -> bool:
         clear(b)
         if b.n_aligned != s.n_aligned:
             steps.forget(b)
+            b.t_block = s.t + BLOCK
+            for g in range(N_FAMILIES):
+                b.peak[g], b.waiting[g], b.usual[g] = 0.0, 0.0, 0.0
         b.n_aligned, b.t_slot, b.t_judge = s.n_aligned, s.t, s.t
         for a in range(len(b.slope)):
             b.slope[a] = 0.0
@@ -165,7 +173,7 @@ def tick(s: Any, prm: Any, dt: float) -> bool:
         if known(s) and not sick(b):
             if b.span > 0.0:
                 move(b)
-            open_slot(b, next_slot(b, s.t), s.t)
+            open_slot(b, next_slot(b, s.t), s.t, dcm((s.q[0], s.q[1], s.q[2], s.q[3]))[2])
         else:
             clear(b)
     if b.fresh == 1 and s.t >= b.t_judge:
@@ -187,12 +195,30 @@ def follow(s: Any, dt: float) -> None:
 
 
 @jit
+def usual(b: Any, g: int) -> float:
+    """Factor on the threshold of a family from what its statistic has come to in this flight: innovations are not white."""
+    return max(1.0, BEYOND_USUAL * b.usual[g])
+
+
+@jit
+def learn_usual(b: Any, t: float) -> None:
+    """At the end of a block, take its maxima into what is usual, one block late: a fault shall not raise its own threshold."""
+    if t < b.t_block:
+        return
+    b.t_block = t + BLOCK
+    for g in range(N_FAMILIES):
+        b.usual[g] += (RISE if b.waiting[g] > b.usual[g] else FALL) * (b.waiting[g] - b.usual[g])
+        b.waiting[g] = min(b.peak[g], CAP)
+        b.peak[g] = 0.0
+
+
+@jit
 def weigh(s: Any, prm: Any) -> tuple[int, float]:
     """Statistic of every family: which is the largest, and the largest ratio of one to its threshold, tolerances left out."""
     b = s.bank[0]
     for g in range(N_FAMILIES):
-        b.level[g], b.fault[g], b.slot[g] = 0.0, NONE, 0
-    b.ratio, ratio, tilting = 0.0, 0.0, 0.0
+        b.level[g], b.beyond[g], b.fault[g], b.slot[g] = 0.0, 0.0, NONE, 0
+    b.ratio, tilting = 0.0, 0.0
     for f in range(N_FAULTS):
         g = family_of(f)
         tolerance, largest, least = free(prm, f), most(f), 0.25 * prm.diagnosis_threshold
@@ -201,7 +227,7 @@ def weigh(s: Any, prm: Any) -> tuple[int, float]:
             j = f * SLOTS + k
             den = b.den[j]
             num = abs(b.num[j])
-            if num * num > least * den and den > LEAST and num > tolerance * den:
+            if num * num > least * den and den > LEAST:
                 span = GRID + 0.2 * (s.t - b.onset[k])
                 size = min(num / den, largest)
                 level = size * (2.0 * num - size * den)  # twice the gain in log likelihood; num²/den where the size is free
@@ -209,16 +235,21 @@ def weigh(s: Any, prm: Any) -> tuple[int, float]:
                     continue
                 if level > b.level[g]:
                     b.level[g], b.fault[g], b.slot[g] = level, f, k
+                if num <= tolerance * den:
+                    continue
                 beyond = (level - tolerance * (2.0 * num - tolerance * den)) / h
-                ratio = max(ratio, beyond)
+                b.beyond[g] = max(b.beyond[g], beyond)
                 if g < F_VELOCITY and g != 2 and beyond > b.ratio:
                     b.ratio, tilting = beyond, level
     if tilting < b.level[F_COMPASS]:
         b.ratio = 0.0
-    lead = 0
+    lead, ratio = 0, 0.0
     for g in range(N_FAMILIES):
         if b.level[g] > b.level[lead]:
             lead = g
+        b.peak[g] = max(b.peak[g], b.beyond[g])
+        b.beyond[g] /= usual(b, g)
+        ratio = max(ratio, b.beyond[g])
     return lead, ratio
 
 
@@ -245,8 +276,9 @@ def in_samples(s: Any, g: int) -> bool:
 def judge(s: Any, prm: Any) -> bool:
     """Alarm, set or name from the bank as it stands; True when the state was changed."""
     b = s.bank[0]
+    learn_usual(b, s.t)
     lead, ratio = weigh(s, prm)
-    if ratio < 1.0:
+    if b.beyond[lead] < 1.0:  # what explains most is no fault
         if b.alarm != 0 and ratio < 0.5:
             b.alarm = 0
         return False
@@ -260,7 +292,7 @@ def judge(s: Any, prm: Any) -> bool:
         if g != lead and top - b.level[g] < margin:
             candidates |= 1 << g
             others += 1
-    if others == 0 and top > prm.diagnosis_threshold * (1.0 if lead < F_VELOCITY else OTHERS):
+    if others == 0:
         return name(s, prm, lead)
     if b.alarm == 1 and s.t - b.t_seen > TELL:
         b.alarm = 2
@@ -276,11 +308,11 @@ def tell(s: Any, prm: Any, code: Any, g: int, candidates: int) -> None:
     f, k = b.fault[g], b.slot[g]
     j = f * SLOTS + k
     n = s.n_events
-    threshold = prm.diagnosis_threshold * (1.0 if g < F_VELOCITY else OTHERS)
+    threshold = prm.diagnosis_threshold * (1.0 if g < F_VELOCITY else OTHERS) * usual(b, g)
     event_since(s, s.t, b.onset[k], code, NO_SENSOR, b.level[g], threshold, f)
     if s.n_events > n:
         e = s.event[n]
-        e.seen, e.size, e.sd, e.candidates = b.t_seen, b.num[j] / b.den[j], 1.0 / math.sqrt(b.den[j]), candidates
+        e.seen, e.size, e.sd, e.candidates = max(b.t_seen, b.onset[k]), b.num[j] / b.den[j], 1.0 / math.sqrt(b.den[j]), candidates
 
 
 @jit

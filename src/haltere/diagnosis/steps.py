@@ -23,7 +23,7 @@ from haltere.strapdown.propagate import inject
 __all__ = ["DEATHS", "DROPOUT", "NOISE", "SATURATE", "STEP", "STUCK", "forget", "refuted", "shown", "watch"]
 
 #: Samples of each half of a step; shortest and longest interval at which steps can be told from motion [s].
-HALF, SHORTEST, LONGEST = 6, 2e-4, 8.5e-3
+HALF, SHORTEST, LONGEST = 6, 2e-4, 5.2e-3
 #: Memory of the differences' mean square where it falls and where it rises [s], from how many samples on it is known, and how far a lone one may move it.
 MEMORY, ALERT, WARM, LONE = 2.0, 0.5, 250, 9.0
 #: A step in sigma; what the other gyro axes may show of it, and the accelerometer [sigma]; how level the halves are (of 10 degrees of
@@ -274,6 +274,9 @@ def extreme(d: Any, c: int, size: float, begin: float, end: float) -> tuple[floa
         if d.h_t[i] > begin and d.h_t[i] - INTERVAL < end:
             z = max(z, d.h_high[i, c] if size > 0.0 else -d.h_low[i, c])
             sd = max(sd, d.h_sd[i, c])
+    if end > d.t_interval - INTERVAL:  # the interval that is not over yet
+        z = max(z, d.high[c] if size > 0.0 else -d.low[c])
+        sd = max(sd, scale(d, c))
     return z, sd
 
 

@@ -31,6 +31,7 @@ __all__ = [
     "POSITION",
     "SLOTS",
     "VELOCITY",
+    "YAW",
     "clear",
     "matched",
     "move",
@@ -38,14 +39,19 @@ __all__ = [
     "restart_transition",
 ]
 
-#: Signatures: first of each kind. Those of VELOCITY, POSITION and HEADING are of GNSS and compass; the last is a jump of the offset.
-GYRO, ACCEL, GYRO_RAMP, ACCEL_RAMP, VELOCITY, POSITION, HEADING, BAROMETER_OFFSET = (constant(i) for i in (0, 3, 6, 9, 12, 15, 18, 19))
-N_FAULTS = constant(20)
+Vec = tuple[float, float, float]
+
+#: Signatures: first of each kind. Those of VELOCITY, POSITION and HEADING are of GNSS and compass; the
+#: last two are jumps of the barometer's offset, and of yaw: a heading that was wrong shows when the vehicle accelerates.
+GYRO, ACCEL, GYRO_RAMP, ACCEL_RAMP, VELOCITY, POSITION, HEADING, BAROMETER_OFFSET, YAW = (
+    constant(i) for i in (0, 3, 6, 9, 12, 15, 18, 19, 20)
+)
+N_FAULTS = constant(21)
 #: Onsets that are kept. Column fault * SLOTS + slot of every array of the bank belongs to a fault and an onset.
 SLOTS = constant(20)
 BANK_COLUMNS = int(N_FAULTS * SLOTS)
 #: Columns that are worked on together: what of them is needed stays in the nearest cache.
-WIDTH = constant(80)
+WIDTH = constant(60)
 #: Responses are in single precision: a statistic need not be better, and twice as many are worked on at once.
 ZERO, ONE = np.float32(0.0), np.float32(1.0)
 #: A whitened innovation counts up to so many sigma, more by this factor of the one before it: a lone outlier proves nothing.
@@ -92,8 +98,8 @@ def clear(b: Any) -> None:
 
 
 @jit
-def open_slot(b: Any, k: int, t: float) -> None:
-    """Let slot ``k`` stand for faults that begin at t [s]."""
+def open_slot(b: Any, k: int, t: float, down: Vec) -> None:
+    """Let slot ``k`` stand for faults that begin at t [s]; ``down`` is the vertical in the body frame."""
     x = b.x
     b.live[k], b.onset[k] = 1, t
     for f in range(N_FAULTS):
@@ -104,6 +110,7 @@ def open_slot(b: Any, k: int, t: float) -> None:
     for a in range(3):
         x[9 + a, (GYRO + a) * SLOTS + k] = 1.0
         x[12 + a, (ACCEL + a) * SLOTS + k] = 1.0
+        x[a, YAW * SLOTS + k] = down[a]
     if x.shape[0] > 15:
         x[15, BAROMETER_OFFSET * SLOTS + k] = 1.0
 

@@ -276,6 +276,11 @@ def _bank(n: int) -> np.dtype[np.void]:
         ("n_aligned", "i8"),
         ("yaw", "f8"),  # ``yaw_corrected`` as it was
         ("level", "f8", 14),  # by family: largest statistic, its fault and slot
+        ("beyond", "f8", 14),  # likewise in thresholds; maxima of this block, of the one before, and what is usual
+        ("peak", "f8", 14),
+        ("waiting", "f8", 14),
+        ("usual", "f8", 14),
+        ("t_block", "f8"),
         ("fault", "i8", 14),
         ("slot", "i8", 14),
         ("alarm", "i8"),  # 1: seen, 2: told as a set
