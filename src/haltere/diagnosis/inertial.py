@@ -15,7 +15,8 @@ from haltere._jit import constant, jit
 from haltere.aids import compass
 from haltere.aids.fusing import DISTRUSTED, RUNNING
 from haltere.aids.record import E_FAULT, E_SUSPECT, GNSS_POSITION, GNSS_VELOCITY, NO_SENSOR, event_since
-from haltere.core.rotation import Mat, dcm
+from haltere.aids.magnetometer import heading_row
+from haltere.core.rotation import Mat, Vec, dcm
 from haltere.filter.signatures import (
     ACCEL,
     ACCEL_RAMP,
@@ -48,6 +49,8 @@ F_ACCEL, F_VELOCITY, F_POSITION, F_COMPASS, F_BAROMETER = (constant(i) for i in 
 NONE = constant(-1)
 #: Spacing of new onsets, how old the oldest may be, time between judgements, and how long a set is kept for itself [s].
 GRID, OLDEST, EVERY, TELL = 0.25, 15.0, 0.1, 2.5
+#: An inertial fault is named so long [s] after the alarm at the earliest: what is sudden is rather in what was measured.
+SETTLE = 0.25
 #: By how much a name must exceed the others; and for an axis of the gyro against that of the accelerometer which looks most like it.
 MARGIN, MARGIN_ALIKE = 9.0, 16.0
 #: Margin where the raw samples show the step; and as a part of the statistic, since responses are linear and onsets on a grid.
@@ -61,6 +64,8 @@ GYRO_STEEPEST, ACCEL_STEEPEST = math.radians(0.3), 0.12
 OTHERS = 2.0
 #: The threshold is at least so many times the usual maximum of a block [s]; how fast that is learnt, a part each block; its bound.
 BEYOND_USUAL, BLOCK, RISE, FALL, CAP = 2.0, 10.0, 0.6, 0.1, 2.0
+#: Most that the change of heading may say.
+HEADING_SAYS = 40.0
 #: Least information on a size, in 1/(unit)^2, and the part of a size that its onset and linearity leave open, 1 sigma.
 LEAST, LEFT = 1.0, 0.1
 #: From this uncertainty of attitude on the bank listens: 1 sigma of tilt and of yaw [rad].
@@ -173,7 +178,7 @@ def tick(s: Any, prm: Any, dt: float) -> bool:
         if known(s) and not sick(b):
             if b.span > 0.0:
                 move(b)
-            open_slot(b, next_slot(b, s.t), s.t, dcm((s.q[0], s.q[1], s.q[2], s.q[3]))[2])
+            open_slot(s, next_slot(b, s.t), dcm((s.q[0], s.q[1], s.q[2], s.q[3]))[2])
         else:
             clear(b)
     if b.fresh == 1 and s.t >= b.t_judge:
@@ -213,12 +218,32 @@ def learn_usual(b: Any, t: float) -> None:
 
 
 @jit
+def by_heading(s: Any, prm: Any, row: Vec, k: int, j: int, size: float) -> float:
+    """What the change of heading since onset ``k`` says for column ``j``: gain in twice the log likelihood over no fault.
+
+    The filter takes a compass for hardly better than its calibration; without turning no calibration error changes, so that the change
+    since the onset is known much better (`haltere.aids.compass`). It decides between faults but raises no alarm.
+    """
+    b = s.bank[0]
+    q = b.q[k]
+    same = s.q[0] * q[0] + s.q[1] * q[1] + s.q[2] * q[2] + s.q[3] * q[3]
+    turned = 2.0 * math.sqrt(max(0.0, 1.0 - same * same))
+    wrong = prm.robust_calibration * turned / math.cos(s.field[1])
+    variance = prm.robust_heading * prm.robust_heading + wrong * wrong
+    change = b.heading - b.heading_then[k]
+    left = change - size * (row[0] * b.x[0, j] + row[1] * b.x[1, j] + row[2] * b.x[2, j])
+    return min(max((change * change - left * left) / variance, -HEADING_SAYS), HEADING_SAYS)
+
+
+@jit
 def weigh(s: Any, prm: Any) -> tuple[int, float]:
     """Statistic of every family: which is the largest, and the largest ratio of one to its threshold, tolerances left out."""
     b = s.bank[0]
     for g in range(N_FAMILIES):
         b.level[g], b.beyond[g], b.fault[g], b.slot[g] = 0.0, 0.0, NONE, 0
     b.ratio, tilting = 0.0, 0.0
+    heard = s.has_field == 1 and s.compass.out == 0 and s.t - b.t_heading < 0.5
+    row = heading_row(dcm((s.q[0], s.q[1], s.q[2], s.q[3])), s.field[0], s.field[1])
     for f in range(N_FAULTS):
         g = family_of(f)
         tolerance, largest, least = free(prm, f), most(f), 0.25 * prm.diagnosis_threshold
@@ -233,8 +258,11 @@ def weigh(s: Any, prm: Any) -> tuple[int, float]:
                 level = size * (2.0 * num - size * den)  # twice the gain in log likelihood; num²/den where the size is free
                 if f < GYRO_RAMP and refuted(b, f, math.copysign(size, b.num[j]), b.onset[k] - span, b.onset[k] + span):
                     continue
-                if level > b.level[g]:
-                    b.level[g], b.fault[g], b.slot[g] = level, f, k
+                said = 0.0
+                if heard and f < VELOCITY:
+                    said = by_heading(s, prm, row, k, j, math.copysign(size, b.num[j]))
+                if level + said > b.level[g]:
+                    b.level[g], b.fault[g], b.slot[g] = level + said, f, k
                 if num <= tolerance * den:
                     continue
                 beyond = (level - tolerance * (2.0 * num - tolerance * den)) / h
@@ -292,7 +320,7 @@ def judge(s: Any, prm: Any) -> bool:
         if g != lead and top - b.level[g] < margin:
             candidates |= 1 << g
             others += 1
-    if others == 0:
+    if others == 0 and (lead >= F_VELOCITY or s.t - b.t_seen >= SETTLE):
         return name(s, prm, lead)
     if b.alarm == 1 and s.t - b.t_seen > TELL:
         b.alarm = 2

@@ -29,6 +29,8 @@ MEMORY, ALERT, WARM, LONE = 2.0, 0.5, 250, 9.0
 #: A step in sigma; what the other gyro axes may show of it, and the accelerometer [sigma]; how level the halves are (of 10 degrees of
 #: freedom), and by how much a step must fit better than a straight line, in variances.
 LARGE, ASIDE, QUIET, LEVEL, BETTER = 9.0, 0.4, 6.0, 2.3, 25.0
+#: Square of a specific force beside the half before, of 3 degrees of freedom, that is a shock.
+SHOCK = 20.0
 #: After rest steps are not looked for during this time [s].
 SPIN_UP = 2.0
 #: Part of a step that its size may be off by, 1 sigma.
@@ -142,6 +144,16 @@ def step_of(s: Any, c: int, t: float) -> bool:
         if a != c and abs(d.z_before[a]) > max(5.0, ASIDE * abs(z)):
             return False
         if abs(d.z_before[3 + a]) > QUIET:
+            return False
+    for i in range(2 * HALF + 1):  # contact: what turns the vehicle at once pushes it, too
+        q = 0.0
+        for a in range(3, 6):
+            level = 0.0
+            for j in range(HALF):
+                level += d.u[(h - HALF - 1 - j) % n, a] / HALF
+            x = d.u[(h - i) % n, a] - level
+            q += x * x / max(d.square[a], 1e-12)
+        if q > SHOCK:
             return False
     after, before = 0.0, 0.0
     for i in range(HALF):

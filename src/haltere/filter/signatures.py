@@ -52,9 +52,12 @@ SLOTS = constant(20)
 BANK_COLUMNS = int(N_FAULTS * SLOTS)
 #: Columns that are worked on together: what of them is needed stays in the nearest cache.
 WIDTH = constant(60)
+#: How fast the heading's innovation is smoothed, a part each sample.
+HEARD = 0.2
 #: Responses are in single precision: a statistic need not be better, and twice as many are worked on at once.
 ZERO, ONE = np.float32(0.0), np.float32(1.0)
-#: A whitened innovation counts up to so many sigma, more by this factor of the one before it: a lone outlier proves nothing.
+#: A whitened innovation counts up to so many sigma, more by this factor of the one before it: a lone outlier proves nothing. Beyond, its
+#: variance is inflated instead of the innovation cut: cut ones would look like something that grows.
 ALONE, FOLLOWED = 4.0, 1.2
 #: Components of an innovation that have a signature of their own: six of GNSS, and the heading (see haltere.aids.record).
 N_GNSS, C_HEADING = 6, 7
@@ -98,10 +101,13 @@ def clear(b: Any) -> None:
 
 
 @jit
-def open_slot(b: Any, k: int, t: float, down: Vec) -> None:
-    """Let slot ``k`` stand for faults that begin at t [s]; ``down`` is the vertical in the body frame."""
+def open_slot(s: Any, k: int, down: Vec) -> None:
+    """Let slot ``k`` stand for faults that begin now; ``down`` is the vertical in the body frame."""
+    b = s.bank[0]
     x = b.x
-    b.live[k], b.onset[k] = 1, t
+    b.live[k], b.onset[k], b.heading_then[k] = 1, s.t, b.heading
+    for i in range(4):
+        b.q[k, i] = s.q[i]
     for f in range(N_FAULTS):
         j = f * SLOTS + k
         b.num[j], b.den[j] = 0.0, 0.0
@@ -190,13 +196,16 @@ def matched(s: Any, H: Row, S: float, y: float, component: int, evidence: bool, 
     x, e, num, den = b.x, b.e, b.num, b.den
     z, weight = 0.0, 0.0
     if evidence:
-        sd = math.sqrt(S)
+        z = y / math.sqrt(S)
         most = ALONE + FOLLOWED * abs(b.last[component])
-        z = min(max(y / sd, -most), most)
-        b.last[component] = z
-        z /= sd
-        weight = 1.0 / S
+        share = min(1.0, most / max(abs(z), 1e-9))
+        b.last[component] = share * z
+        weight = share * share / S
+        z = weight * y
         b.fresh = 1
+        if component == C_HEADING:
+            b.heading += HEARD * (y - b.heading)
+            b.t_heading = s.t
     z4, weight4 = np.float32(z), np.float32(weight)
     own = -1
     if evidence and component < N_GNSS:

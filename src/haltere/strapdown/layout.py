@@ -267,6 +267,10 @@ def _bank(n: int) -> np.dtype[np.void]:
         ("den", "f4", BANK_COLUMNS),
         ("live", "i8", int(SLOTS)),
         ("onset", "f8", int(SLOTS)),
+        ("q", "f8", (int(SLOTS), 4)),  # attitude and innovation of heading then
+        ("heading_then", "f8", int(SLOTS)),
+        ("heading", "f8"),  # innovation of heading lately, and when
+        ("t_heading", "f8"),
         ("phi", _TRANSITION),
         ("span", "f8"),
         ("last", "f8", 20),  # whitened innovation before, by component
