@@ -228,9 +228,10 @@ def by_heading(s: Any, prm: Any, row: Vec, k: int, j: int, size: float) -> float
     q = b.q[k]
     same = s.q[0] * q[0] + s.q[1] * q[1] + s.q[2] * q[2] + s.q[3] * q[3]
     turned = 2.0 * math.sqrt(max(0.0, 1.0 - same * same))
+    change = b.heading - b.heading_then[k]
+    turned = max(0.0, turned - abs(change))  # a gyro that fails turns the estimate, not the compass
     wrong = prm.robust_calibration * turned / math.cos(s.field[1])
     variance = prm.robust_heading * prm.robust_heading + wrong * wrong
-    change = b.heading - b.heading_then[k]
     left = change - size * (row[0] * b.x[0, j] + row[1] * b.x[1, j] + row[2] * b.x[2, j])
     return min(max((change * change - left * left) / variance, -HEADING_SAYS), HEADING_SAYS)
 
