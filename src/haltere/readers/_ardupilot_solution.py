@@ -118,6 +118,11 @@ def add_solution(log: DataFlash, builder: Builder, params: dict[str, float]) -> 
             if "AZbias" in states:
                 columns["accel_bias_z"] = states.get("AZbias") * 0.01  # whole cm/s^2
             pieces.append((us, columns))
+        for lane, states in _lanes(log, family.replace("KF", "KV"), 2).items():
+            us = log.us(states)
+            mine = _rows_in_charge(us, lane, charge) if "C" in states else np.ones(len(us), bool)  # else logged of the primary lane only
+            variances = {f"sd_wind_{a}": states.get(f"V{k}")[mine] for a, k in (("n", 22), ("e", 23))}
+            pieces.append((us[mine], {name: np.sqrt(np.where(v > 0.0, v, np.nan)) for name, v in variances.items()}))
         if not has_origin:
             builder.note("onboard has no pos_n, pos_e, pos_d: the log has no ORGN message, so their origin is unknown")
     else:
