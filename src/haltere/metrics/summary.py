@@ -14,6 +14,7 @@ from haltere.metrics.consistency import nees_series, nees_table, nis_table
 from haltere.metrics.errors import error_series, error_table
 from haltere.metrics.sensors import findings, sampling, sensor_table
 from haltere.metrics.whiteness import whiteness_series, whiteness_table
+from haltere.metrics.wind_quality import wind_table
 
 __all__ = ["finite", "gaps_of", "summarise"]
 
@@ -86,6 +87,9 @@ def summarise(solution: Solution, flight: FlightLog, facts: dict[str, Any], scor
         }
     summary["health"] = _health(solution, flight)
     summary["sensors"] = sensor_table(solution, flight) if scored else {}
+    wind = wind_table(solution, flight) if scored else {}
+    if wind:
+        summary["wind"] = wind
     summary["findings"] = findings(summary["sensors"])
     summary["warnings"] = facts["warnings"]
     summary["timings"] = facts["timings"]
