@@ -5,11 +5,13 @@ Error state: q_true = q ⊗ δq(δθ) (body), everything else true minus estimat
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 from haltere._jit import jit
 from haltere.core.rotation import Mat, Vec, cross, dcm, dot, mat_vec, quat_from_rotvec, quat_mul, quat_unit, rotvec_dcm
 from haltere.filter.update import symmetrise
+from haltere.strapdown.optional import add_optional
 
 __all__ = ["inject", "left_F", "mechanise", "predict", "propagate", "transition", "turn"]
 
@@ -179,6 +181,15 @@ def propagate(s: Any, prm: Any, C: Mat, D: Mat, A: Mat, B: Mat, dt: float) -> No
     o = 15 + len(s.baro)
     for i in range(len(s.mag)):
         P[o + i, o + i] += prm.noise_mag_offset * prm.noise_mag_offset * dt
+    o += len(s.mag)
+    scale = 1.0
+    if len(s.drag) > 0:
+        scale = math.exp(s.drag[0])  # wind is kept times mu
+    for i in range(len(s.wind)):
+        walk = scale * (prm.noise_wind if i < 2 else prm.noise_wind_d)
+        P[o + i, o + i] += walk * walk * dt
+    for i in range(o + len(s.wind), s.P.shape[0]):
+        P[i, i] += prm.noise_air_walk * prm.noise_air_walk * dt
     if dt > 0.02:  # below that the off-diagonal blocks are lost in the noise (theory-amendments.md §8)
         for i in range(3):
             c = -0.5 * qbg * dt * dt
@@ -208,11 +219,7 @@ def inject(s: Any) -> None:
         s.p[i] += dx[6 + i]
         s.bg[i] += dx[9 + i]
         s.ba[i] += dx[12 + i]
-    for i in range(len(s.baro)):
-        s.baro[i] += dx[15 + i]
-    o = 15 + len(s.baro)
-    for i in range(len(s.mag)):
-        s.mag[i] += dx[o + i]
+    add_optional(s, dx, 15)
     for j in range(n):
         c = cross(t, (P[0, j], P[1, j], P[2, j]))
         P[0, j] -= 0.5 * c[0]
