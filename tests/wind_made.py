@@ -52,5 +52,8 @@ def with_wind(
         "weight": np.ones(n), "status": np.full(n, "fused"), "reason": np.full(n, ""),
     }  # fmt: skip
     aids = {k: np.concatenate([v, made[k]]) for k, v in solution.aids.items() if k in made}
-    summary = {**solution.summary, "nis": {**solution.summary["nis"], sensor: {"mean": nis, "band": [0.9, 1.1], "n": n, "rejected": 0, "deweighted": 0, "lost": 0.0}}}
+    summary = {
+        **solution.summary,
+        "nis": {**solution.summary["nis"], sensor: {"mean": nis, "band": [0.9, 1.1], "n": n, "rejected": 0, "deweighted": 0, "lost": 0.0}},
+    }
     return dataclasses.replace(solution, table=table, aids=aids, summary=summary)

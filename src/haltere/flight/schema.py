@@ -147,22 +147,6 @@ STREAMS: dict[str, StreamSchema] = {
             ),
             ("t",),
         ),
-        StreamSchema(
-            "wind",
-            "wind given from outside: a station, a mast, a forecast",
-            (
-                T,
-                *_ned("wind", "m/s", "velocity of the air over ground (blowing to)"),
-                Column("sd", "m/s", "", "1 sigma of each component"),
-            ),
-            ("t", "wind_n", "wind_e"),
-        ),
-        StreamSchema(
-            "attitude",
-            "attitude given from outside",
-            (T, *(Column(f"q_{a}", "1", "body to NED", f"attitude quaternion q_nb, {a} part (Hamilton)") for a in "wxyz")),
-            ("t", "q_w", "q_x", "q_y", "q_z"),
-        ),
         StreamSchema("rotors", "rotor speeds and commands: speed_0 ... [rad/s], command_0 ... [0-1]", (T,), ("t",)),
         StreamSchema(
             "power",

@@ -18,6 +18,9 @@ from haltere.metrics.wind_quality import wind_table
 
 __all__ = ["finite", "gaps_of", "summarise"]
 
+#: What is said of a wind told for a flight of which none is estimated.
+UNUSED_WIND = "the wind told from outside was not used: it takes rotors or an airspeed in the log, and an estimator with a wind"
+
 
 def gaps_of(t: np.ndarray[Any, np.dtype[np.float64]]) -> int:
     """Number of intervals longer than four times the median, and than a tenth of a second."""
@@ -91,7 +94,8 @@ def summarise(solution: Solution, flight: FlightLog, facts: dict[str, Any], scor
     if wind:
         summary["wind"] = wind
     summary["findings"] = findings(summary["sensors"])
-    summary["warnings"] = facts["warnings"]
+    unused = "wind" in flight and len(flight["wind"]) > 0 and "wind_n" not in solution
+    summary["warnings"] = facts["warnings"] + ([UNUSED_WIND] if unused else [])
     summary["timings"] = facts["timings"]
     solution.summary = finite(summary)
 

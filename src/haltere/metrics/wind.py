@@ -223,8 +223,6 @@ def profile(w: WindSeries) -> Profile | None:
     if not use.any():
         return None
     low, high = np.percentile(w.height[use], [0.5, 99.5])
-    if high - low < RANGE:
-        return None
     width = next((h for h in HEIGHTS if (high - low) / h <= 10.0), HEIGHTS[-1])
     row = np.floor(w.height[use] / width).astype(np.intp)
     first = int(row.min())
@@ -238,10 +236,11 @@ def profile(w: WindSeries) -> Profile | None:
     wind = np.column_stack([mean(w.wind[use, k]) for k in range(2)])
     speed = mean(w.speed[use])
     spread = np.sqrt(np.maximum(mean(w.speed[use] ** 2) - speed**2, 0.0))
+    middle = mean(w.height[use])
     keep = seconds >= BIN_TIME
-    if np.count_nonzero(keep) < 2:
+    if np.count_nonzero(keep) < 2 or np.ptp(middle[keep]) < RANGE:
         return None
-    parts = (mean(w.height[use]), wind, speed, spread, mean(w.speed_sd[use]), seconds)
+    parts = (middle, wind, speed, spread, mean(w.speed_sd[use]), seconds)
     height, wind, speed, spread, sd, seconds = (np.asarray(p[keep], np.float64) for p in parts)
     return Profile(height, wind, speed, spread, sd, seconds, _law(height, speed, seconds))
 
