@@ -280,12 +280,14 @@ def _table(rows: FloatArray, S: NDArray[np.void], position: bool) -> dict[str, F
     return out
 
 
-#: Columns of the optional states in the order of `haltere.strapdown.optional`; those in `_LOGARITHMIC` are states as logarithms.
+#: Columns of the optional states in the order of `haltere.strapdown.optional`; those in `_LOGARITHMIC` are states as logarithms,
+#: those without a name are not given out.
 _OPTIONAL = {
     "baro": ("baro_bias",),
     "mag": ("mag_offset_x", "mag_offset_y", "mag_offset_z"),
     "wind": ("wind_n", "wind_e", "wind_d"),
     "drag": ("drag_mu", "drag_c", "drag_offset_x", "drag_offset_y"),
+    "steady": ("", ""),
     "vane": ("airspeed_scale", "aoa_offset", "sideslip_offset"),
 }
 _LOGARITHMIC = ("drag_mu", "drag_c", "airspeed_scale")
@@ -297,6 +299,8 @@ def _optional(rows: FloatArray, S: NDArray[np.void]) -> tuple[dict[str, FloatArr
     values: dict[str, FloatArray] = {}
     deviations: dict[str, FloatArray] = {}
     for i, name in enumerate(names):
+        if not name:  # kept inside
+            continue
         value, sd = rows[35 + i], rows[35 + len(names) + i]
         np.sqrt(np.maximum(sd, 0.0, out=sd), out=sd)
         if name in _LOGARITHMIC:

@@ -3,9 +3,10 @@
 A row of the air has five blocks, see `haltere.filter.update`: attitude, velocity, accelerometer bias, wind (with the state after it,
 where the wind is horizontal) and what else the measurement depends on.
 
-In a layout with drag the state is not W but µW, what the wind pushes the vehicle with. At a hover drag measures that product, whatever µ
-is. With W as the state, the direction that stays unobserved, δW = -W δln µ, would turn with every change of the estimate, and the filter
-would believe that it learnt µ from the turning; with µW it is the same direction for ever (theory.md §6, rule c).
+In a layout with drag the state is not the wind W but A = µW + c|W|W, the specific force that it has on a vehicle at hover. There drag
+measures A, whatever µ and c are. With W as the state, the direction that stays unobserved, of more wind and less drag, would turn with
+every change of the estimate, and the filter would believe that it learnt the drag from the turning; with A it is the same direction for
+ever, and µ and c are learnt from the vehicle's own motion alone (theory.md §6, rule c).
 """
 
 from __future__ import annotations
@@ -25,6 +26,8 @@ __all__ = [
     "AirOffer",
     "AirRow",
     "air_velocity",
+    "by_quadratic",
+    "calm",
     "core_blocks",
     "memory",
     "moves",
@@ -32,6 +35,7 @@ __all__ = [
     "wind_block",
     "wind_covariance",
     "wind_n",
+    "wind_rows",
 ]
 
 AirRow = tuple[Block, Block, Block, Block, Block]
@@ -47,6 +51,14 @@ HELD = 2.0
 
 
 @jit
+def calm(a_n: float, a_e: float, mu: float, c: float) -> tuple[float, float]:
+    """Horizontal wind [m/s] whose specific force at hover is A [m/s^2]: |W| (µ + c|W|) = |A|, along A."""
+    size = math.sqrt(a_n * a_n + a_e * a_e)
+    k = 2.0 / (mu + math.sqrt(mu * mu + 4.0 * c * size))
+    return k * a_n, k * a_e
+
+
+@jit
 def wind_n(s: Any) -> Vec:
     """Wind [m/s] in NED, where the air blows to; what is no state is zero."""
     n, e, d = 0.0, 0.0, 0.0
@@ -55,17 +67,43 @@ def wind_n(s: Any) -> Vec:
     if len(s.wind) > 2:
         d = s.wind[2]
     if len(s.drag) > 0:
-        k = math.exp(-s.drag[0])
-        n, e = k * n, k * e
+        n, e = calm(n, e, math.exp(s.drag[0]), math.exp(s.drag[1]))
     return (n, e, d)
 
 
 @jit
-def wind_covariance(s: Any, P: Any) -> tuple[float, float, float, float, float, float]:
-    """Upper triangle of the wind's covariance [m^2/s^2] out of one of the whole state; zero for what is no state.
+def by_push(s: Any, W: Vec) -> tuple[float, float, float]:
+    """∂W/∂A where the state is A, a symmetric matrix: north-north, north-east, east-east; ((µ + c|W|) 1 + c W Wᵀ/|W|)⁻¹."""
+    mu, c = math.exp(s.drag[0]), math.exp(s.drag[1])
+    size = max(math.sqrt(W[0] * W[0] + W[1] * W[1]), 1e-9)
+    k = c / size
+    nn, ne, ee = mu + c * size + k * W[0] * W[0], k * W[0] * W[1], mu + c * size + k * W[1] * W[1]
+    i = 1.0 / (nn * ee - ne * ne)
+    return i * ee, -i * ne, i * nn
 
-    Of µW and ln µ it is that of δW = δ(µW)/µ - W δln µ, to first order.
-    """
+
+@jit
+def wind_rows(s: Any, W: Vec) -> tuple[tuple[float, float, float, float], tuple[float, float, float, float]]:
+    """Derivatives of the wind's north and east against the states A (2), ln µ and ln c."""
+    nn, ne, ee = by_push(s, W)
+    mu, c = math.exp(s.drag[0]), math.exp(s.drag[1]) * math.sqrt(W[0] * W[0] + W[1] * W[1])
+    n, e = nn * W[0] + ne * W[1], ne * W[0] + ee * W[1]
+    return (nn, ne, -mu * n, -c * n), (ne, ee, -mu * e, -c * e)
+
+
+@jit
+def quadratic(P: Any, o: int, a: tuple[float, float, float, float], b: tuple[float, float, float, float]) -> float:
+    """aᵀ P b of the four states from ``o`` on."""
+    out = 0.0
+    for i in range(4):
+        for j in range(4):
+            out += a[i] * P[o + i, o + j] * b[j]
+    return out
+
+
+@jit
+def wind_covariance(s: Any, P: Any) -> tuple[float, float, float, float, float, float]:
+    """Upper triangle of the wind's covariance [m^2/s^2] out of one of the whole state, to first order; zero for what is no state."""
     o = 15 + len(s.baro) + len(s.mag)
     nn, ne, nd, ee, ed, dd = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
     if len(s.wind) > 0:
@@ -73,10 +111,8 @@ def wind_covariance(s: Any, P: Any) -> tuple[float, float, float, float, float, 
     if len(s.wind) > 2:
         nd, ed, dd = P[o, o + 2], P[o + 1, o + 2], P[o + 2, o + 2]
     if len(s.drag) > 0:
-        W, k, m = wind_n(s), math.exp(-s.drag[0]), o + 2
-        nn = k * k * nn - 2.0 * k * W[0] * P[o, m] + W[0] * W[0] * P[m, m]
-        ne = k * k * ne - k * (W[1] * P[o, m] + W[0] * P[o + 1, m]) + W[0] * W[1] * P[m, m]
-        ee = k * k * ee - 2.0 * k * W[1] * P[o + 1, m] + W[1] * W[1] * P[m, m]
+        n, e = wind_rows(s, wind_n(s))
+        nn, ne, ee = quadratic(P, o, n, n), quadratic(P, o, n, e), quadratic(P, o, e, e)
     return (nn, ne, nd, ee, ed, dd)
 
 
@@ -101,11 +137,18 @@ def wind_block(s: Any, e: Vec, after: float) -> Block:
     """
     o = 15 + len(s.baro) + len(s.mag)
     if len(s.drag) > 0:
-        k, W = math.exp(-s.drag[0]), wind_n(s)
-        return (o, (-k * e[0], -k * e[1], after + e[0] * W[0] + e[1] * W[1]))
+        n, east = wind_rows(s, wind_n(s))
+        return (o, (-e[0] * n[0] - e[1] * east[0], -e[0] * n[1] - e[1] * east[1], after - e[0] * n[2] - e[1] * east[2]))
     if len(s.wind) == 3:
         return (o, (-e[0], -e[1], -e[2]))
     return (o, (-e[0], -e[1], after))
+
+
+@jit
+def by_quadratic(s: Any, e: Vec) -> float:
+    """What a measurement with ∂h/∂v = e changes with ln c by way of the wind."""
+    n, east = wind_rows(s, wind_n(s))
+    return -e[0] * n[3] - e[1] * east[3]
 
 
 @jit

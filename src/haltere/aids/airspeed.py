@@ -32,7 +32,7 @@ def offer(s: Any, prm: Any, m: Any) -> AirOffer:
     k = math.exp(s.vane[0])
     h = k * speed
     theta, vel, e = core_blocks(C, v_a, (k * v_a[0] / speed, k * v_a[1] / speed, k * v_a[2] / speed))
-    o = 15 + len(s.baro) + len(s.mag) + len(s.wind) + len(s.drag)
+    o = 15 + len(s.baro) + len(s.mag) + len(s.wind) + len(s.drag) + len(s.steady)
     after, scale = 0.0, single(o, h)
     if len(s.wind) == 2 and len(s.drag) == 0:
         after, scale = h, NONE

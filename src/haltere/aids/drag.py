@@ -12,7 +12,7 @@ from typing import Any
 
 from haltere._jit import constant, jit
 from haltere.aids import rest
-from haltere.aids.air import SILENT, AirOffer, air_velocity, core_blocks, moves, wind_block
+from haltere.aids.air import SILENT, AirOffer, air_velocity, by_quadratic, core_blocks, moves, wind_block
 from haltere.aids.fusing import RUNNING
 from haltere.aids.record import C_DRAG, DRAG, R_NONE
 from haltere.core.earth import STANDARD_DENSITY, density
@@ -155,12 +155,12 @@ def offer(s: Any, prm: Any) -> AirOffer:
 
 @jit
 def _row(s: Any, C: tuple[Vec, Vec, Vec], v_a: Vec, speed: float, mu: float, c: float, axis: int) -> Any:
-    """Row of drag along a body axis (0: x, 1: y), see `haltere.aids.air`; ln µ and ln c at a constant state of the wind."""
+    """Row of drag along a body axis (0: x, 1: y), see `haltere.aids.air`."""
     k = c * v_a[axis] / max(speed, 1e-6)
     on = -mu - c * speed
     d = (on - k * v_a[0] if axis == 0 else -k * v_a[0], on - k * v_a[1] if axis == 1 else -k * v_a[1], -k * v_a[2])
     theta, vel, e = core_blocks(C, v_a, d)
     x, y = (1.0, 0.0) if axis == 0 else (0.0, 1.0)
     o = 15 + len(s.baro) + len(s.mag) + len(s.wind)
-    coefficients = (o + 1, (-c * speed * v_a[axis], x, y))
+    coefficients = (o + 1, (-c * speed * v_a[axis] + by_quadratic(s, e), x, y))
     return (theta, vel, (BA, (x, y, 0.0)), wind_block(s, e, -mu * v_a[axis]), coefficients)

@@ -50,7 +50,7 @@ def offer(s: Any, prm: Any, m: Any) -> AirOffer:
         return SILENT
     alpha, da = angle_of_attack(v_a)
     beta, db = sideslip(v_a)
-    o = 15 + len(s.baro) + len(s.mag) + len(s.wind) + len(s.drag)
+    o = 15 + len(s.baro) + len(s.mag) + len(s.wind) + len(s.drag) + len(s.steady)
     theta, vel, e = core_blocks(C, v_a, da)
     first = (theta, vel, NONE, wind_block(s, e, 0.0), single(o + 1, 1.0))
     theta, vel, e = core_blocks(C, v_a, db)

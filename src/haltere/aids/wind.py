@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-import math
 from typing import Any
 
 from haltere._jit import constant, jit
-from haltere.aids.air import SILENT, AirOffer, memory, moves, single, wind_n
+from haltere.aids.air import SILENT, AirOffer, memory, moves, single, wind_n, wind_rows
 from haltere.aids.fusing import RUNNING, THREE
 from haltere.aids.record import C_WIND, R_NONE, WIND
 from haltere.core.rotation import Vec
@@ -24,8 +23,9 @@ ALIKE = 10.0
 def _row(s: Any, axis: int) -> Any:
     o = 15 + len(s.baro) + len(s.mag)
     if len(s.drag) > 0:
-        W = wind_n(s)
-        return (NONE, NONE, NONE, single(o + axis, math.exp(-s.drag[0])), single(o + 2, -W[axis]))
+        n, e = wind_rows(s, wind_n(s))
+        row = n if axis == 0 else e
+        return (NONE, NONE, NONE, (o, (row[0], row[1], row[2])), single(o + 3, row[3]))
     return (NONE, NONE, NONE, single(o + min(axis, len(s.wind) - 1), 1.0), NONE)
 
 

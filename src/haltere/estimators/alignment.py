@@ -206,8 +206,14 @@ def start_air(s: Any, prm: Any, o: int) -> None:
         sd = scale * (prm.init_wind if i < 2 else prm.init_wind_d)
         s.wind[i] = 0.0
         P[o + i, o + i] = sd * sd
-    for i in range(len(s.vane)):
+    for i in range(len(s.steady)):  # all that is known of the wind before any is felt is known of its mean
         k = o + len(s.wind) + len(s.drag) + i
+        s.steady[i] = 0.0
+        P[k, k] = P[o + i, o + i]
+        P[o + i, k], P[k, o + i] = P[k, k], P[k, k]
+        P[o + i, o + i] += scale * scale * prm.wind_gust * prm.wind_gust
+    for i in range(len(s.vane)):
+        k = o + len(s.wind) + len(s.drag) + len(s.steady) + i
         sd = prm.init_airspeed_scale if i == 0 else prm.init_vane
         s.vane[i] = 0.0
         P[k, k] = sd * sd

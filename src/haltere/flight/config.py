@@ -110,7 +110,13 @@ KEYS: dict[str, Key] = {
         "m/s",
         "Fake velocity of ahrs, 1 sigma at 5 Hz: worth 2 m/s that last a second. Lower trusts gravity more, accelerations less.",
     ),
-    "noise.wind": _positive(0.3, "m/s/sqrt(s)", "Walk of the horizontal wind. Higher follows gusts sooner, and is less sure."),
+    "noise.wind": _positive(
+        0.3, "m/s/sqrt(s)", "Walk of the horizontal wind that air data show. Higher follows gusts sooner, and is less sure."
+    ),
+    "noise.wind_mean": _positive(0.05, "m/s/sqrt(s)", "Walk of the mean wind of a multirotor, which gusts return to."),
+    "wind.gust": _positive(0.3, "m/s", "Gusts of a multirotor's wind, 1 sigma in calm air."),
+    "wind.turbulence": Key(0.2, "1", "Gusts more in proportion to the mean wind.", low=0.0, high=2.0),
+    "wind.gust_time": _positive(3.0, "s", "How long a gust lasts."),
     "noise.wind_d": _positive(0.1, "m/s/sqrt(s)", "Walk of the vertical wind."),
     "noise.air_walk": _positive(
         2e-3, "1/sqrt(s)", "Walk of what air data depend on: relative for drag and airspeed scale, in m/s^2 and rad for offsets."
@@ -321,8 +327,8 @@ _TWO_STAGE = tuple(key for key in KEYS if key.startswith("two_stage."))
 #: What only an estimator with wind has.
 _AIR = tuple(
     key for key in KEYS
-    if not key.startswith("delay.") and (key.startswith(("air.", "drag.")) or key.partition(".")[2] in (
-        "wind", "wind_d", "air_walk", "airspeed", "aoa", "sideslip", "airdata_time", "no_sideslip", "drag", "drag_time", "given_wind",
+    if not key.startswith("delay.") and (key.startswith(("air.", "drag.", "wind.")) or key.partition(".")[2] in (
+        "wind", "wind_d", "wind_mean", "air_walk", "airspeed", "aoa", "sideslip", "airdata_time", "no_sideslip", "drag", "drag_time", "given_wind",
         "air", "airdata", "vanes", "airspeed_scale", "vane",
     ))
 )  # fmt: skip

@@ -233,6 +233,7 @@ STAGE = _record(
     ("mag", "f8", (0,)),
     ("wind", "f8", (0,)),
     ("drag", "f8", (0,)),
+    ("steady", "f8", (0,)),
     ("vane", "f8", (0,)),
     ("P", "f8", (CORE, CORE)),
     ("dx", "f8", CORE),
@@ -252,7 +253,7 @@ PARAMETERS = np.dtype(
             "noise_gnss_velocity noise_gnss_position noise_gnss_altitude noise_gnss_velocity_min noise_gnss_position_min "
             "noise_barometer noise_magnetometer noise_field noise_field_time noise_mag_offset "
             "noise_zero_velocity noise_zero_rate noise_fake_position noise_fake_position_rest noise_fake_velocity "
-            "noise_wind noise_wind_d noise_air_walk noise_airspeed noise_aoa noise_sideslip noise_no_sideslip noise_drag noise_given_wind "
+            "noise_wind noise_wind_d noise_wind_mean noise_air_walk wind_gust wind_turbulence wind_gust_time  noise_airspeed noise_aoa noise_sideslip noise_no_sideslip noise_drag noise_given_wind "
             "noise_attitude noise_attitude_yaw noise_attitude_time noise_drag_time noise_airdata_time "
             "gate_gnss gate_barometer gate_magnetometer gate_zero_velocity gate_zero_rate gate_air gate_attitude "
             "delay_gnss_velocity delay_gnss_position delay_barometer delay_magnetometer delay_power "
@@ -294,7 +295,7 @@ def layout(baro: int = 0, mag: int = 0, stages: int = 0, wind: int = 0, drag: in
     wind
         2 with the horizontal wind as states, 3 with all of it, else 0.
     drag
-        4 with the drag of a multirotor as states, else 0; it needs a wind of 2.
+        4 with the drag of a multirotor as states, and the wind that gusts return to, else 0; it needs a wind of 2.
     vane
         1 with the scale of the airspeed as a state, 3 with the offsets of both vanes too, else 0.
 
@@ -303,7 +304,7 @@ def layout(baro: int = 0, mag: int = 0, stages: int = 0, wind: int = 0, drag: in
     numpy.dtype
         Nominal state, covariance ``P`` (n, n), scratch, queues, monitors and counters: the whole memory of a filter.
     """
-    n = CORE + baro + mag + wind + drag + vane
+    n = CORE + baro + mag + wind + (drag + 2 if drag else 0) + vane
     return np.dtype(
         [
             ("t", "f8"),
@@ -314,8 +315,9 @@ def layout(baro: int = 0, mag: int = 0, stages: int = 0, wind: int = 0, drag: in
             ("ba", "f8", 3),
             ("baro", "f8", (baro,)),
             ("mag", "f8", (mag,)),  # offset of the magnetometer in the body frame [uT]
-            ("wind", "f8", (wind,)),  # NED [m/s]; times mu, so [m/s^2], in a layout with drag
+            ("wind", "f8", (wind,)),  # NED [m/s]; in a layout with drag its force at hover [m/s^2], see `aids.air`
             ("drag", "f8", (drag,)),  # ln mu [1/s], ln c [1/m], offset of the thrust's axis along x and y [m/s^2]
+            ("steady", "f8", (2 if drag else 0,)),  # what the wind returns to after gusts, likewise
             ("vane", "f8", (vane,)),  # ln of the airspeed's scale, offsets of angle of attack and sideslip [rad]
             ("P", "f8", (n, n)),
             ("dx", "f8", n),

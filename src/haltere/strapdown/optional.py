@@ -24,6 +24,9 @@ def get_optional(s: Any, x: Any, k: int) -> None:
     for i in range(len(s.drag)):
         x[k + i] = s.drag[i]
     k += len(s.drag)
+    for i in range(len(s.steady)):
+        x[k + i] = s.steady[i]
+    k += len(s.steady)
     for i in range(len(s.vane)):
         x[k + i] = s.vane[i]
 
@@ -39,6 +42,8 @@ def put_optional(s: Any, x: Any, k: int) -> None:
         s.wind[i] = 0.0
     for i in range(len(s.drag)):
         s.drag[i] = 0.0
+    for i in range(len(s.steady)):
+        s.steady[i] = 0.0
     for i in range(len(s.vane)):
         s.vane[i] = 0.0
     add_optional(s, x, k)
@@ -59,5 +64,8 @@ def add_optional(s: Any, x: Any, k: int) -> None:
     for i in range(len(s.drag)):
         s.drag[i] += x[k + i]
     k += len(s.drag)
+    for i in range(len(s.steady)):
+        s.steady[i] += x[k + i]
+    k += len(s.steady)
     for i in range(len(s.vane)):
         s.vane[i] += x[k + i]
