@@ -20,11 +20,11 @@ def flown(mission: str, duration: float = 60.0, north: float = 4.0, east: float 
     """A simulated flight in wind and its solution without any wind."""
     wind = {"n": north, "e": east, "gust": gust, "shear": shear}
     flight = simulate(Scenario(name=mission, mission=mission, duration=duration, seed=3, wind=wind))
-    return flight, drive.run(flight, rate=20.0)
+    return flight, drive.run(flight, rate=20.0, set={"aid.drag": "off", "aid.airdata": "off"})
 
 
 def with_wind(
-    flight: FlightLog, solution: Solution, *, sd: float = 0.4, prior: float = 5.0, seconds: float = 10.0, seed: int = 1,
+    flight: FlightLog, solution: Solution, *, sd: float = 0.4, prior: float = 5.0, seconds: float = 4.0, seed: int = 1,
     sensor: str = "drag", nis: float = 1.0, mu: tuple[float, float] | None = (0.15, 0.02), scale: float = 1.0,
 ) -> Solution:  # fmt: skip
     """The solution with the true wind plus a slow error of ``scale`` times the stated 1 sigma, which falls from ``prior`` to ``sd`` [m/s].
