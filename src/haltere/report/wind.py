@@ -119,7 +119,7 @@ def _speed(c: Context, w: WindSeries) -> Figure:
             1, label, "text", t, turns - 360.0 * np.floor((turns - about) / 360.0 + 0.5), symbol="diamond-open", size=8, unit="deg"
         )
     low, high = panels.extent[0]
-    panels.extent[0] = (min(0.0, low) if low < 1.0 else low, high)
+    panels.extent[0] = (0.0 if low < 1.0 else low, high)  # a band may reach below zero, a speed does not
     figure = panels.figure()
     _compass(figure["layout"]["yaxis2"], about)
     figure["reading"] = "The band is 1σ, first order. Where no direction is drawn the wind is weaker than its own uncertainty." + (
