@@ -115,6 +115,36 @@ def test_without_uncertainty_truth_and_autopilot_there_are_no_empty_panels() -> 
     assert wind(Context(dataclasses.replace(bare, table=none), flight, Pool())) is None
 
 
+def test_what_was_smoothed_and_what_was_told_are_drawn_too() -> None:
+    solution, flight = made()
+    smoothed = dataclasses.replace(solution, table={k: v for k, v in solution.table.items() if not k.startswith("drag")})
+    told = Stream({"t": [0.0, 60.0], "wind_n": [4.0, 4.0], "wind_e": [0.6, 0.6], "wind_d": [0.0, 0.0], "sd": [1.0, 1.0]})
+    s, _ = section(dataclasses.replace(solution, smoothed=smoothed), FlightLog({**flight.streams, "wind": told}, flight.meta))
+    for name in ("wind", "wind_components"):
+        assert {"smoothed", "given", "estimate"} <= {t["name"] for t in figure(s, name)["traces"]}
+
+
+def test_what_is_estimated_with_air_data_is_named() -> None:
+    solution, flight = made()
+    n = len(solution)
+    table = {**solution.table, "airspeed_scale": np.ones(n), "sd_airspeed_scale": np.full(n, 0.1), "aoa_offset": np.full(n, 0.02)}
+    s, _ = section(dataclasses.replace(solution, table=table), flight)
+    assert figure(s, "wind_coefficients")["reading"] == "Of the airspeed its scale, of the angle of attack its offset."
+
+
+@pytest.mark.parametrize("rows", [slice(None), slice(200, 600), slice(0, 3), slice(-3, None)])
+def test_a_wind_that_is_not_finite_breaks_nothing(rows: slice) -> None:
+    solution, flight = made()
+    table = dict(solution.table)
+    for name in ("wind_n", "sd_wind_e", "drag_mu"):
+        table[name] = table[name].copy()
+        table[name][rows] = np.nan
+    torn = dataclasses.replace(solution, table=table)
+    torn = dataclasses.replace(torn, summary={**solution.summary, "wind": finite(wind_table(torn, flight))})
+    assert torn.summary["wind"]["verdict"] in ("good", "usable", "poor", "not observable")
+    assert "wind" in page(torn, flight)
+
+
 def test_a_mean_wind_in_words() -> None:
     mean = {"speed": 5.23, "sd_speed": 0.41, "from_deg": 213.4, "sd_from_deg": 4.2}
     assert wind_in_words({"mean": mean}) == "5.2 ± 0.41 m/s from 213° ± 5° (SSW)"
