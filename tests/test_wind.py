@@ -238,6 +238,8 @@ def test_the_verdict_is_good_with_motion_and_a_learned_drag() -> None:
         ("figure-eight", {"sd": 1.6}, "poor", "1.6 m/s over the second half"),
         ("figure-eight", {"sd": 4.0}, "not observable", "4 m/s over the second half"),
         ("figure-eight", {"mu": (0.15, 0.14)}, "usable", "not learned in this flight"),
+        ("hover", {"mu": (0.35, 0.34), "drift": 0.33}, "poor", "moved by a factor of"),
+        ("figure-eight", {"mu": (0.35, 0.1), "drift": 1.5, "sd": 0.3}, "good", "went from ±35 %"),
         ("figure-eight", {"nis": 2.5}, "usable", "the stated 1σ is too small"),
         ("figure-eight", {"nis": 9.0}, "poor", "not to be believed"),
         ("figure-eight", {"nis": 0.1}, "good", "set larger than this flight shows"),

@@ -40,6 +40,8 @@ AIR = {"drag": "drag", "airdata": "air data", "wind": "a given wind"}
 GOOD, USABLE, UNLEARNED = 0.5, 1.0, 0.7
 #: Turn of the heading [rad] and change of the velocity [m/s], 5th to 95th percentile, from which a flight counts as excited.
 TURNED, SPED = math.radians(45.0), 2.0
+#: An estimate that moved by so many times what it learned is not to be believed.
+ASTRAY = 4.0
 #: Mean normalised innovation squared above which what is stated is too sure, and far too sure.
 SURE, FAR_TOO_SURE = 1.5, 3.0
 #: Coefficients that the wind hangs on and their names in words.
@@ -150,7 +152,11 @@ def _learned(judge: _Judge, solution: Solution, w: WindSeries) -> bool:
         if not (math.isfinite(before) and math.isfinite(after) and before > 0.0):
             continue
         said = f"the {word} went from ±{100.0 * before:.2g} % to ±{100.0 * after:.2g} %"
-        if after > UNLEARNED * before:
+        # An estimate moves by what it learned: the variances' difference. More is no learning but a drift.
+        shift = abs(math.log(abs(float(solution[name][last] / solution[name][0]))))
+        if shift > ASTRAY * math.sqrt(max(before**2 - after**2, (0.3 * before) ** 2)):
+            judge.say(f"{said} but moved by a factor of {math.exp(shift):.2g}, more than that says: it is not to be believed", 2)
+        elif after > UNLEARNED * before:
             judge.say(f"{said}: not learned in this flight, and the air speed scales with it", 1)
         else:
             drag |= name == "drag_mu"
