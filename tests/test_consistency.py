@@ -83,7 +83,7 @@ def _rotorcraft_scores(flights: int, first_seed: int) -> tuple[dict[tuple[str, s
 def test_nees_of_simulated_rotorcraft_is_inside_the_band(flights: int, first: int) -> None:
     """Every block of filter and smoother inside the 99.9 % χ² band of so many flights, and the smoother's errors smaller."""
     nees, squares = _rotorcraft_scores(flights, first)
-    assert set(nees) == {(which, block) for which in ("filter", "smoother") for block in DOF}
+    assert set(nees) >= {(which, block) for which in ("filter", "smoother") for block in DOF if block != "wind"}
     for (which, block), value in nees.items():
         low, high = band(DOF[block], float(flights), 0.999)
         assert low < value < high, (which, block, value, low, high)
@@ -109,7 +109,7 @@ def test_the_band_catches_sensors_worse_than_the_filter_is_told() -> None:
 def test_nees_of_50_flights_is_inside_the_band() -> None:
     """Every block inside the 99.9 % χ² band of 50 independent flights (samples of one flight are not independent)."""
     nees, nis = _mean_nees(50, 500)
-    assert set(nees) == set(DOF)
+    assert set(nees) == set(DOF) - {"wind"}  # nothing in these flights feels the air
     for block, value in nees.items():
         low, high = band(DOF[block], 50.0, 0.999)
         assert low < value < high, (block, value, low, high)

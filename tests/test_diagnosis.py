@@ -162,7 +162,7 @@ def transition(rng: np.random.Generator) -> tuple[Any, FloatArray]:
 @needs_inner
 def test_the_bank_is_what_dense_matrices_make_of_it() -> None:
     rng = np.random.default_rng(3)
-    S = np.zeros(1, layout(1, 0, 0, 1))
+    S = np.zeros(1, layout(1, banks=1))
     S = S if COMPILED else S.view(np.recarray)
     s = S[0]
     s["q"][0] = 1.0
@@ -208,7 +208,7 @@ def test_the_bank_is_what_dense_matrices_make_of_it() -> None:
 
 @needs_inner
 def test_a_lone_outlier_proves_nothing_and_what_stays_does() -> None:
-    S = np.zeros(1, layout(1, 0, 0, 1))
+    S = np.zeros(1, layout(1, banks=1))
     S = S if COMPILED else S.view(np.recarray)
     s = S[0]
     b = s["bank"][0]
@@ -227,7 +227,7 @@ def test_a_lone_outlier_proves_nothing_and_what_stays_does() -> None:
 
 @needs_inner
 def test_onsets_are_close_when_they_are_recent_and_reach_back() -> None:
-    S = np.zeros(1, layout(1, 0, 0, 1))
+    S = np.zeros(1, layout(1, banks=1))
     S = S if COMPILED else S.view(np.recarray)
     b = S[0]["bank"][0]
     for i in range(400):
@@ -415,5 +415,7 @@ def test_an_hour_without_a_fault_has_no_alarm() -> None:
     for i in range(40):
         mission = ("hover", "lissajous", "box", "tour")[i % 4]
         flight = simulate(Scenario(mission=mission, duration=90.0, seed=9500 + i, wind=WIND if i % 8 < 4 else {}))
-        bad = [e for e in run(flight, scored=False).events if e["sensor"] in ("gyro", "accel", "gnss", "barometer") and e["kind"] != "reset"]
+        bad = [
+            e for e in run(flight, scored=False).events if e["sensor"] in ("gyro", "accel", "gnss", "barometer") and e["kind"] != "reset"
+        ]
         assert bad == [], (i, bad)

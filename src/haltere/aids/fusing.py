@@ -36,7 +36,10 @@ __all__ = [
     "NO_GATE",
     "NO_TIMEOUT",
     "NO_TURN",
+    "ONLY_AIR",
     "ONLY_TURN",
+    "ONLY_WIND",
+    "WITH_DRAG",
     "Offer",
     "Robust",
     "fuse_offer",
@@ -53,8 +56,9 @@ Offer = tuple[int, int, Vec, Vec, Vec, tuple[Row, Row, Row], float, float, int, 
 #: and how many successive samples share one error (1: none): a factor on r that no test sees.
 Robust = tuple[int, float, float, float]
 
-#: The gain as it is, only its turn about the vertical, or all but that.
-ANY_TURN, ONLY_TURN, NO_TURN = (constant(i) for i in (0, 1, 2))
+#: The gain as it is, only its turn about the vertical, all but that, only what it does to the wind and what air data depend on, that
+#: without the coefficients of drag, or all with these: no other code moves them, see `haltere.aids.drag`.
+ANY_TURN, ONLY_TURN, NO_TURN, ONLY_AIR, ONLY_WIND, WITH_DRAG = (constant(i) for i in (0, 1, 2, 3, 4, 5))
 
 #: No robust weight: all up to the gate.
 HARD = (PLAIN, 1e9, 1.0, 1.0)
@@ -117,7 +121,7 @@ def judge(s: Any, sensor: int, t: float, ratio: float, timeout: float, reason: i
 
 
 @jit
-def fuse_offer(s: Any, aids: Any, t: float, sensor: int, offer: Offer) -> None:
+def fuse_offer(s: Any, aids: Any, t: float, sensor: int, offer: Any) -> None:
     """Test the components of an offer together (NIS/gate²), fuse them one after the other, and record them.
 
     Parameters
@@ -129,7 +133,7 @@ def fuse_offer(s: Any, aids: Any, t: float, sensor: int, offer: Offer) -> None:
     sensor
         Code.
     offer
-        What the aid has to say, see `Offer`.
+        What the aid has to say, see `Offer`; rows may have any number of blocks.
     """
     n, component, z, h, r, H, gate, timeout, reason, turn, robust = offer
     form, soft, weighed, shared = robust
@@ -165,14 +169,18 @@ def fuse_offer(s: Any, aids: Any, t: float, sensor: int, offer: Offer) -> None:
                 row, r_i, e_i, ok = H2, r[2], e[2], ok2
             if ok:
                 variance_i = optimal_gain(s, row, r_i)
-                if turn != ANY_TURN:
+                if len(s.wind) > 0:
+                    mask_air(s, turn)
+                if turn in (ONLY_TURN, NO_TURN):
                     project_gain(s, turn == ONLY_TURN)
                 e_i = innovation(s, row, e_i)
                 if len(s.bank) > 0:
                     matched(s, row, variance_i, e_i, component + i, sensor <= MAGNETOMETER and component != C_MAG, True)
                 apply(s, row, r_i, e_i)
         inject(s)
-    elif len(s.bank) > 0 and reason == R_INNOVATION and s.aid[sensor].started != DISTRUSTED and sensor <= MAGNETOMETER and component != C_MAG:
+    elif (
+        len(s.bank) > 0 and reason == R_INNOVATION and s.aid[sensor].started != DISTRUSTED and sensor <= MAGNETOMETER and component != C_MAG
+    ):
         for i in range(n):  # what the filter refuses is evidence all the same
             row = H0 if i == 0 else (H1 if i == 1 else H2)
             if z[i] == z[i]:
@@ -180,6 +188,17 @@ def fuse_offer(s: Any, aids: Any, t: float, sensor: int, offer: Offer) -> None:
     for i in range(n):
         if z[i] == z[i]:
             record(s, aids, t, sensor, component + i, z[i], e[i], math.sqrt(s_ii[i]), ratio, weight, status, reason)
+
+
+@jit
+def mask_air(s: Any, turn: int) -> None:
+    """Keep of the gain in ``s.k`` what the codes from `ONLY_AIR` on say; the coefficients of drag are the two states after the wind."""
+    o = 15 + len(s.baro) + len(s.mag)
+    if turn in (ONLY_AIR, ONLY_WIND):
+        for i in range(o):
+            s.k[i] = 0.0
+    if len(s.drag) > 0 and turn not in (ONLY_AIR, WITH_DRAG):
+        s.k[o + len(s.wind)], s.k[o + len(s.wind) + 1] = 0.0, 0.0
 
 
 @jit

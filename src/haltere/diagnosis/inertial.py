@@ -14,9 +14,11 @@ from typing import Any
 from haltere._jit import constant, jit
 from haltere.aids import compass
 from haltere.aids.fusing import DISTRUSTED, RUNNING
-from haltere.aids.record import E_FAULT, E_SUSPECT, GNSS_POSITION, GNSS_VELOCITY, NO_SENSOR, event_since
 from haltere.aids.magnetometer import heading_row
+from haltere.aids.record import E_FAULT, E_SUSPECT, GNSS_POSITION, GNSS_VELOCITY, NO_SENSOR, event_since
 from haltere.core.rotation import Mat, Vec, dcm
+from haltere.diagnosis import steps
+from haltere.diagnosis.steps import refuted, shown
 from haltere.filter.signatures import (
     ACCEL,
     ACCEL_RAMP,
@@ -33,8 +35,6 @@ from haltere.filter.signatures import (
     move,
     open_slot,
 )
-from haltere.diagnosis import steps
-from haltere.diagnosis.steps import refuted, shown
 from haltere.strapdown.propagate import inject, left_F
 
 __all__ = ["FAMILIES", "N_FAMILIES", "carry", "heal", "judge", "tick"]

@@ -17,7 +17,7 @@ from haltere.aids import compass
 from haltere.aids.record import E_FAULT, E_OVER, NO_SENSOR, event_since
 from haltere.core.rotation import Vec, dcm
 from haltere.filter.signatures import clear
-from haltere.strapdown.layout import STEP_HISTORY, STEP_RING
+from haltere.strapdown.bank import STEP_HISTORY, STEP_RING
 from haltere.strapdown.propagate import inject
 
 __all__ = ["DEATHS", "DROPOUT", "NOISE", "SATURATE", "STEP", "STUCK", "forget", "refuted", "shown", "watch"]

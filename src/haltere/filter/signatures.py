@@ -117,7 +117,7 @@ def open_slot(s: Any, k: int, down: Vec) -> None:
         x[9 + a, (GYRO + a) * SLOTS + k] = 1.0
         x[12 + a, (ACCEL + a) * SLOTS + k] = 1.0
         x[a, YAW * SLOTS + k] = down[a]
-    if x.shape[0] > 15:
+    if len(s.baro) > 0:
         x[15, BAROMETER_OFFSET * SLOTS + k] = 1.0
 
 

@@ -12,7 +12,7 @@ from functools import cache
 import numpy as np
 
 from haltere._jit import constant
-from haltere.filter.signatures import BANK_COLUMNS, SLOTS
+from haltere.strapdown.bank import bank
 
 __all__ = [
     "AID_STATE",
@@ -29,8 +29,6 @@ __all__ = [
     "POS",
     "REST",
     "STAGE",
-    "STEP_HISTORY",
-    "STEP_RING",
     "THETA",
     "VEL",
     "layout",
@@ -47,12 +45,10 @@ CORE = 15
 IMU_CAPACITY = 512
 MEASUREMENT_CAPACITY = 128
 EVENT_CAPACITY = 32
+#: Sensors whose measurements are queued.
+N_QUEUES = 10
 #: Tenths of a second that the compass watch looks back, in a plain number: it is a modulus.
 COMPASS_BINS = constant(128)
-#: Raw IMU samples that the search for steps looks back, likewise.
-STEP_RING = constant(16)
-#: Quarters of a second that the extremes of steps are kept.
-STEP_HISTORY = constant(64)
 
 
 def _record(*fields: tuple[object, ...]) -> np.dtype[np.void]:
@@ -118,6 +114,8 @@ ALIGNMENT = _record(
     ("t_baro", "f8"),
     ("n_baro", "f8"),
     ("kind", "i8"),
+    ("given", "f8", 4),  # attitude told from outside, and when
+    ("t_given", "f8"),
 )
 
 #: Bank of yaw hypotheses: states [v_N, v_E, yaw error], covariances, weights, and the velocity increment since the last fix.
@@ -206,6 +204,22 @@ MOTORS = _record(
     ("sd", "f8"),
 )
 
+#: What the air aids remember: the last stretch of specific force in flight, and how the rotors' speed goes with thrust.
+AIR = _record(
+    ("t", "f8"),  # since when it is gathered [s]
+    ("dt", "f8"),
+    ("f", "f8", 3),  # integral of the raw specific force [m/s]
+    ("v", "f8", 3),  # velocity NED [m/s] and attitude at its start
+    ("q", "f8", 4),
+    ("airborne", "i8"),
+    ("level", "f8"),  # height down [m] where it last rested
+    ("t_rest", "f8"),
+    ("t_rotors", "f8"),
+    ("speed", "f8"),  # sum of the rotors' speeds [rad/s]
+    ("ratio", "f8"),  # that over the square root of thrust, slowly followed
+    ("n_ratio", "i8"),
+)
+
 #: ``onset`` and ``threshold`` where there is one, else the time itself and NaN.
 EVENT = _record(
     ("t", "f8"),
@@ -221,82 +235,6 @@ EVENT = _record(
     ("candidates", "i8"),
 )
 
-#: What `haltere.diagnosis.steps` remembers of the raw samples: six channels, gyro and then accelerometer.
-STEPS = _record(
-    ("head", "i8"),
-    ("filled", "i8"),
-    ("u", "f8", (int(STEP_RING), 6)),
-    ("when", "f8", int(STEP_RING)),
-    ("after", "f8", 6),  # sums of the two halves, and the step between them [sigma], now and one sample ago
-    ("before", "f8", 6),
-    ("z", "f8", 6),
-    ("z_before", "f8", 6),
-    ("low", "f8", 6),  # extremes of that since the last interval began, and of each interval with its 1 sigma
-    ("high", "f8", 6),
-    ("t_free", "f8"),  # steps are looked for from here on
-    ("t_interval", "f8"),
-    ("h_head", "i8"),
-    ("h_t", "f8", int(STEP_HISTORY)),
-    ("h_low", "f8", (int(STEP_HISTORY), 6)),
-    ("h_high", "f8", (int(STEP_HISTORY), 6)),
-    ("h_sd", "f8", (int(STEP_HISTORY), 6)),
-    ("square", "f8", 6),  # mean square of a difference over two samples
-    ("held", "f8", 6),  # the last value, how often it has come, the longest such run before, the largest size before
-    ("run", "i8", 6),
-    ("t_run", "f8", 6),
-    ("longest", "i8", 6),
-    ("peak", "f8", 6),
-    ("quick", "f8", 6),  # mean square of second differences, lately and in the flight
-    ("slow", "f8", 6),
-    ("t_rough", "f8", 6),  # since when it is rough, and what is wrong with the channel: 0 nothing
-    ("wrong", "i8", 6),
-    ("rate", "f8", 3),  # mean square of the rate in flight [rad^2/s^2]
-    ("n", "i8"),
-)
-
-#: Part of Φ since the last fusion, see `haltere.filter.signatures.move`.
-_TRANSITION = _record(("P", "f8", (CORE, CORE)))
-
-
-def _bank(n: int) -> np.dtype[np.void]:
-    """What `haltere.diagnosis` remembers of ``n`` error states: responses to unit faults, a column each, and how they match."""
-    return _record(
-        ("x", "f4", (n, BANK_COLUMNS)),
-        ("e", "f4", BANK_COLUMNS),
-        ("num", "f4", BANK_COLUMNS),
-        ("den", "f4", BANK_COLUMNS),
-        ("live", "i8", int(SLOTS)),
-        ("onset", "f8", int(SLOTS)),
-        ("q", "f8", (int(SLOTS), 4)),  # attitude and innovation of heading then
-        ("heading_then", "f8", int(SLOTS)),
-        ("heading", "f8"),  # innovation of heading lately, and when
-        ("t_heading", "f8"),
-        ("phi", _TRANSITION),
-        ("span", "f8"),
-        ("last", "f8", 20),  # whitened innovation before, by component
-        ("fresh", "i8"),  # evidence has come since the last judgement
-        ("t_slot", "f8"),
-        ("t_judge", "f8"),
-        ("n_aligned", "i8"),
-        ("yaw", "f8"),  # ``yaw_corrected`` as it was
-        ("level", "f8", 14),  # by family: largest statistic, its fault and slot
-        ("beyond", "f8", 14),  # likewise in thresholds; maxima of this block, of the one before, and what is usual
-        ("peak", "f8", 14),
-        ("waiting", "f8", 14),
-        ("usual", "f8", 14),
-        ("t_block", "f8"),
-        ("fault", "i8", 14),
-        ("slot", "i8", 14),
-        ("alarm", "i8"),  # 1: seen, 2: told as a set
-        ("t_seen", "f8"),
-        ("ratio", "f8"),  # statistic of what may have tilted the attitude over its threshold, at the last judgement; 0 if a compass explains more
-        ("slope", "f8", 6),  # of a ramp that was named, by axis, until when
-        ("t_slope", "f8", 6),
-        ("healed", "i8"),
-        ("step", STEPS),
-    )
-
-
 #: A first stage: the part of a state that prediction and updates touch, with the core states only.
 STAGE = _record(
     ("q", "f8", 4),
@@ -306,7 +244,11 @@ STAGE = _record(
     ("ba", "f8", 3),
     ("baro", "f8", (0,)),
     ("mag", "f8", (0,)),
-    ("bank", _bank(CORE), (0,)),
+    ("bank", bank(CORE), (0,)),
+    ("wind", "f8", (0,)),
+    ("drag", "f8", (0,)),
+    ("steady", "f8", (0,)),
+    ("vane", "f8", (0,)),
     ("P", "f8", (CORE, CORE)),
     ("dx", "f8", CORE),
     ("u", "f8", CORE),
@@ -321,20 +263,27 @@ PARAMETERS = np.dtype(
     [
         (name, "f8")
         for name in (
-            "noise_gyro noise_gyro_scale noise_accel noise_gyro_bias noise_accel_bias noise_baro_bias "
+            "noise_gyro noise_gyro_scale noise_between noise_accel noise_gyro_bias noise_accel_bias noise_baro_bias "
             "noise_gnss_velocity noise_gnss_position noise_gnss_altitude noise_gnss_velocity_min noise_gnss_position_min "
             "noise_barometer noise_magnetometer noise_field noise_field_time noise_mag_offset "
             "noise_zero_velocity noise_zero_rate noise_fake_position noise_fake_position_rest noise_fake_velocity "
-            "gate_gnss gate_barometer gate_magnetometer gate_zero_velocity gate_zero_rate "
+            "noise_wind_mean noise_air_walk wind_gust wind_turbulence wind_gust_time "
+            "noise_airspeed noise_aoa noise_sideslip noise_no_sideslip noise_drag noise_given_wind "
+            "noise_attitude noise_attitude_yaw noise_attitude_time noise_drag_time noise_airdata_time "
+            "gate_gnss gate_barometer gate_magnetometer gate_zero_velocity gate_zero_rate gate_air gate_drag gate_attitude "
             "delay_gnss_velocity delay_gnss_position delay_barometer delay_magnetometer delay_power "
+            "delay_rotors delay_airdata delay_wind delay_attitude "
             "aid_gnss aid_barometer aid_magnetometer aid_zero_velocity aid_zero_rate aid_fake_position aid_fake_velocity aid_yaw_bank "
-            "aid_compass_watch aid_motor_field "
-            "timeout_gnss timeout_barometer timeout_magnetometer timeout_imu "
+            "aid_compass_watch aid_motor_field aid_airdata aid_no_sideslip aid_drag aid_wind aid_attitude "
+            "air_moves air_density air_airspeed_min "
+            "drag_mu drag_mu_sd drag_c drag_c_sd drag_offset_sd "
+            "timeout_gnss timeout_barometer timeout_magnetometer timeout_air timeout_drag timeout_attitude timeout_imu "
             "arm_gnss_x arm_gnss_y arm_gnss_z "
             "robust_innovation robust_strength robust_dip robust_heading robust_calibration "
             "field_declination field_dip field_strength field_tolerance_strength field_tolerance_dip "
             "init_tilt_rest init_tilt_motion init_yaw_compass init_yaw_unknown init_gyro_bias_rest init_gyro_bias "
             "init_accel_bias init_velocity init_baro_bias init_mag_offset "
+            "init_wind init_airspeed_scale init_vane "
             "rest_gyro rest_accel rest_gravity "
             "two_stage_tolerance two_stage_k1 two_stage_k2 two_stage_robust two_stage_index two_stage_innovation "
             "two_stage_radial two_stage_memory "
@@ -348,7 +297,7 @@ PARAMETERS = np.dtype(
 
 
 @cache
-def layout(baro: int = 0, mag: int = 0, stages: int = 0, banks: int = 0) -> np.dtype[np.void]:
+def layout(baro: int = 0, mag: int = 0, stages: int = 0, wind: int = 0, drag: int = 0, vane: int = 0, banks: int = 0) -> np.dtype[np.void]:
     """State record type.
 
     Parameters
@@ -359,6 +308,12 @@ def layout(baro: int = 0, mag: int = 0, stages: int = 0, banks: int = 0) -> np.d
         3 with the offset of the magnetometer as states, else 0.
     stages
         1 with a first stage beside the main state (`two-stage`), else 0.
+    wind
+        2 with the horizontal wind as states, and the mean that its gusts return to, 3 with the vertical wind too, else 0.
+    drag
+        4 with the drag of a multirotor as states, else 0; it needs a wind of 2.
+    vane
+        1 with the scale of the airspeed as a state, 3 with the offsets of both vanes too, else 0.
     banks
         1 with the memory of diagnosis, else 0.
 
@@ -367,7 +322,7 @@ def layout(baro: int = 0, mag: int = 0, stages: int = 0, banks: int = 0) -> np.d
     numpy.dtype
         Nominal state, covariance ``P`` (n, n), scratch, queues, monitors and counters: the whole memory of a filter.
     """
-    n = CORE + baro + mag
+    n = CORE + baro + mag + (wind + 2 if wind else 0) + drag + vane
     return np.dtype(
         [
             ("t", "f8"),
@@ -378,6 +333,10 @@ def layout(baro: int = 0, mag: int = 0, stages: int = 0, banks: int = 0) -> np.d
             ("ba", "f8", 3),
             ("baro", "f8", (baro,)),
             ("mag", "f8", (mag,)),  # offset of the magnetometer in the body frame [uT]
+            ("wind", "f8", (wind,)),  # NED [m/s]; in a layout with drag its force at hover [m/s^2], see `aids.air`
+            ("drag", "f8", (drag,)),  # ln mu [1/s], ln c [1/m], offset of the thrust's axis along x and y [m/s^2]
+            ("steady", "f8", (2 if wind else 0,)),  # what the wind returns to after gusts, likewise
+            ("vane", "f8", (vane,)),  # ln of the airspeed's scale, offsets of angle of attack and sideslip [rad]
             ("P", "f8", (n, n)),
             ("dx", "f8", n),
             ("u", "f8", n),
@@ -413,20 +372,21 @@ def layout(baro: int = 0, mag: int = 0, stages: int = 0, banks: int = 0) -> np.d
             ("n_events", "i8"),
             ("n_events_lost", "i8"),
             ("event", EVENT, (EVENT_CAPACITY,)),
-            ("aid", AID_STATE, (9,)),
+            ("aid", AID_STATE, (16,)),
             ("rest", REST),
             ("yaw", YAW_BANK),
             ("compass", COMPASS),
             ("motors", MOTORS),
+            ("air", AIR),
             ("align", ALIGNMENT),
             ("imu_head", "i8"),
             ("imu_n", "i8"),
             ("imu", IMU_SAMPLE, (IMU_CAPACITY,)),
             ("a", STAGE, (stages,)),
-            ("bank", _bank(n), (banks,)),
-            ("ring_head", "i8", 5),
-            ("ring_n", "i8", 5),
-            ("ring", MEASUREMENT, (5, MEASUREMENT_CAPACITY)),
+            ("bank", bank(n), (banks,)),
+            ("ring_head", "i8", N_QUEUES),
+            ("ring_n", "i8", N_QUEUES),
+            ("ring", MEASUREMENT, (N_QUEUES, MEASUREMENT_CAPACITY)),
         ],
         align=True,
     )

@@ -1,0 +1,102 @@
+"""What diagnosis remembers, as record types: responses to unit faults and how they match, and the raw samples of late. No arithmetic."""
+
+from __future__ import annotations
+
+from functools import cache
+
+import numpy as np
+
+from haltere._jit import constant
+from haltere.filter.signatures import BANK_COLUMNS, SLOTS
+
+__all__ = ["STEPS", "STEP_HISTORY", "STEP_RING", "bank"]
+
+#: Raw IMU samples that the search for steps looks back, in a plain number: it is a modulus.
+STEP_RING = constant(16)
+#: Quarters of a second that the extremes of steps are kept.
+STEP_HISTORY = constant(64)
+
+
+def _record(*fields: tuple[object, ...]) -> np.dtype[np.void]:
+    """Nested record type that plain Python can also reach by attribute."""
+    return np.dtype((np.record, list(fields)), align=True)
+
+
+#: What `haltere.diagnosis.steps` remembers of the raw samples: six channels, gyro and then accelerometer.
+STEPS = _record(
+    ("head", "i8"),
+    ("filled", "i8"),
+    ("u", "f8", (int(STEP_RING), 6)),
+    ("when", "f8", int(STEP_RING)),
+    ("after", "f8", 6),  # sums of the two halves, and the step between them [sigma], now and one sample ago
+    ("before", "f8", 6),
+    ("z", "f8", 6),
+    ("z_before", "f8", 6),
+    ("low", "f8", 6),  # extremes of that since the last interval began, and of each interval with its 1 sigma
+    ("high", "f8", 6),
+    ("t_free", "f8"),  # steps are looked for from here on
+    ("t_interval", "f8"),
+    ("h_head", "i8"),
+    ("h_t", "f8", int(STEP_HISTORY)),
+    ("h_low", "f8", (int(STEP_HISTORY), 6)),
+    ("h_high", "f8", (int(STEP_HISTORY), 6)),
+    ("h_sd", "f8", (int(STEP_HISTORY), 6)),
+    ("square", "f8", 6),  # mean square of a difference over two samples
+    ("held", "f8", 6),  # the last value, how often it has come, the longest such run before, the largest size before
+    ("run", "i8", 6),
+    ("t_run", "f8", 6),
+    ("longest", "i8", 6),
+    ("peak", "f8", 6),
+    ("quick", "f8", 6),  # mean square of second differences, lately and in the flight
+    ("slow", "f8", 6),
+    ("t_rough", "f8", 6),  # since when it is rough, and what is wrong with the channel: 0 nothing
+    ("wrong", "i8", 6),
+    ("rate", "f8", 3),  # mean square of the rate in flight [rad^2/s^2]
+    ("n", "i8"),
+)
+
+#: Part of Φ since the last fusion, see `haltere.filter.signatures.move`.
+_TRANSITION = _record(("P", "f8", (15, 15)))
+
+
+@cache
+def bank(n: int) -> np.dtype[np.void]:
+    """What `haltere.diagnosis` remembers of ``n`` error states: responses to unit faults, a column each, and how they match."""
+    return _record(
+        ("x", "f4", (n, BANK_COLUMNS)),
+        ("e", "f4", BANK_COLUMNS),
+        ("num", "f4", BANK_COLUMNS),
+        ("den", "f4", BANK_COLUMNS),
+        ("live", "i8", int(SLOTS)),
+        ("onset", "f8", int(SLOTS)),
+        ("q", "f8", (int(SLOTS), 4)),  # attitude and innovation of heading then
+        ("heading_then", "f8", int(SLOTS)),
+        ("heading", "f8"),  # innovation of heading lately, and when
+        ("t_heading", "f8"),
+        ("phi", _TRANSITION),
+        ("span", "f8"),
+        ("last", "f8", 20),  # whitened innovation before, by component
+        ("fresh", "i8"),  # evidence has come since the last judgement
+        ("t_slot", "f8"),
+        ("t_judge", "f8"),
+        ("n_aligned", "i8"),
+        ("yaw", "f8"),  # ``yaw_corrected`` as it was
+        ("level", "f8", 14),  # by family: largest statistic, its fault and slot
+        ("beyond", "f8", 14),  # likewise in thresholds; maxima of this block, of the one before, and what is usual
+        ("peak", "f8", 14),
+        ("waiting", "f8", 14),
+        ("usual", "f8", 14),
+        ("t_block", "f8"),
+        ("fault", "i8", 14),
+        ("slot", "i8", 14),
+        ("alarm", "i8"),  # 1: seen, 2: told as a set
+        ("t_seen", "f8"),
+        (
+            "ratio",
+            "f8",
+        ),  # statistic of what may have tilted the attitude over its threshold, at the last judgement; 0 if a compass explains more
+        ("slope", "f8", 6),  # of a ramp that was named, by axis, until when
+        ("t_slope", "f8", 6),
+        ("healed", "i8"),
+        ("step", STEPS),
+    )
