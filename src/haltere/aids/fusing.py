@@ -7,7 +7,7 @@ from typing import Any
 
 from haltere._jit import constant, jit
 from haltere.aids.record import (
-    C_MAG,
+    C_HEADING,
     DEWEIGHTED,
     E_TIMEOUT,
     FUSED,
@@ -175,16 +175,14 @@ def fuse_offer(s: Any, aids: Any, t: float, sensor: int, offer: Any) -> None:
                     project_gain(s, turn == ONLY_TURN)
                 e_i = innovation(s, row, e_i)
                 if len(s.bank) > 0:
-                    matched(s, row, variance_i, e_i, component + i, sensor <= MAGNETOMETER and component != C_MAG, True)
+                    matched(s, row, variance_i, e_i, component + i, sensor <= MAGNETOMETER and component <= C_HEADING, True)
                 apply(s, row, r_i, e_i)
         inject(s)
-    elif (
-        len(s.bank) > 0 and reason == R_INNOVATION and s.aid[sensor].started != DISTRUSTED and sensor <= MAGNETOMETER and component != C_MAG
-    ):
+    elif len(s.bank) > 0 and reason == R_INNOVATION and s.aid[sensor].started != DISTRUSTED and sensor <= MAGNETOMETER:
         for i in range(n):  # what the filter refuses is evidence all the same
             row = H0 if i == 0 else (H1 if i == 1 else H2)
             if z[i] == z[i]:
-                matched(s, row, s_ii[i], e[i], component + i, True, False)
+                matched(s, row, s_ii[i], e[i], component + i, component <= C_HEADING, False)
     for i in range(n):
         if z[i] == z[i]:
             record(s, aids, t, sensor, component + i, z[i], e[i], math.sqrt(s_ii[i]), ratio, weight, status, reason)

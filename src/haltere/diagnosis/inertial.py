@@ -16,8 +16,10 @@ from haltere.aids import compass
 from haltere.aids.fusing import DISTRUSTED, RUNNING
 from haltere.aids.magnetometer import heading_row
 from haltere.aids.record import E_FAULT, E_SUSPECT, GNSS_POSITION, GNSS_VELOCITY, NO_SENSOR, event_since
-from haltere.core.rotation import Mat, Vec, dcm
+from haltere.core.rotation import Mat, dcm
 from haltere.diagnosis import steps
+from haltere.diagnosis.heading import by_heading, gyro_that_turns
+from haltere.diagnosis.healing import follow, heal, heal_between
 from haltere.diagnosis.steps import refuted, shown
 from haltere.filter.signatures import (
     ACCEL,
@@ -35,9 +37,9 @@ from haltere.filter.signatures import (
     move,
     open_slot,
 )
-from haltere.strapdown.propagate import inject, left_F
+from haltere.strapdown.propagate import left_F
 
-__all__ = ["FAMILIES", "N_FAMILIES", "carry", "heal", "judge", "tick"]
+__all__ = ["FAMILIES", "N_FAMILIES", "carry", "judge", "tick"]
 
 #: What faults are told apart: gyro and accelerometer axes, GNSS velocity and position, compass, barometer.
 FAMILIES = (
@@ -50,11 +52,12 @@ NONE = constant(-1)
 #: Spacing of new onsets, how old the oldest may be, time between judgements, and how long a set is kept for itself [s].
 GRID, OLDEST, EVERY, TELL = 0.25, 15.0, 0.1, 2.5
 #: An inertial fault is named so long [s] after the alarm at the earliest: what is sudden is rather in what was measured.
-SETTLE = 0.25
+SETTLE = 0.4
 #: By how much a name must exceed the others; and for an axis of the gyro against that of the accelerometer which looks most like it.
 MARGIN, MARGIN_ALIKE = 9.0, 16.0
-#: Margin where the raw samples show the step; and as a part of the statistic, since responses are linear and onsets on a grid.
-SEEN, LINEAR = 2.0, 0.02
+#: What it says for a gyro axis that the raw samples show its step; margins as a part of the statistic, since responses are linear and
+#: onsets on a grid.
+SHOWN, LINEAR = 25.0, 0.02
 #: Changes that are no fault: slopes, as those of a bias over so long [s]; GNSS velocity [m/s], position [m], heading [rad], height [m].
 RAMP_TIME, VELOCITY_FREE, POSITION_FREE, HEADING_FREE, HEIGHT_FREE = 30.0, 0.7, 1.2, 0.1, 1.0
 #: Largest steps [rad/s, m/s^2], steepest ramps [rad/s^2, m/s^3].
@@ -64,14 +67,10 @@ GYRO_STEEPEST, ACCEL_STEEPEST = math.radians(0.3), 0.12
 OTHERS = 2.0
 #: The threshold is at least so many times the usual maximum of a block [s]; how fast that is learnt, a part each block; its bound.
 BEYOND_USUAL, BLOCK, RISE, FALL, CAP = 2.0, 10.0, 0.6, 0.1, 2.0
-#: Most that the change of heading may say.
-HEADING_SAYS = 40.0
-#: Least information on a size, in 1/(unit)^2, and the part of a size that its onset and linearity leave open, 1 sigma.
-LEAST, LEFT = 1.0, 0.1
+#: Least information on a size, in 1/(unit)^2.
+LEAST = 1.0
 #: From this uncertainty of attitude on the bank listens: 1 sigma of tilt and of yaw [rad].
 TILT_KNOWN, YAW_KNOWN = math.radians(5.0), math.radians(25.0)
-#: A ramp that was named is followed for so long; its bias then walks as fast as it goes in about this time [s].
-FOLLOWED, LAG = 10.0, 2.0
 
 
 @jit
@@ -151,10 +150,8 @@ def known(s: Any) -> bool:
 @jit
 def sick(b: Any) -> bool:
     """Whether a channel of the IMU is known to fail: then the bank has nothing to say."""
-    for c in range(6):
-        if b.step.wrong[c] != 0:
-            return True
-    return False
+    w = b.step.wrong
+    return int(w[0] | w[1] | w[2] | w[3] | w[4] | w[5]) != 0
 
 
 @jit
@@ -181,22 +178,19 @@ def tick(s: Any, prm: Any, dt: float) -> bool:
             open_slot(s, next_slot(b, s.t), dcm((s.q[0], s.q[1], s.q[2], s.q[3]))[2])
         else:
             clear(b)
-    if b.fresh == 1 and s.t >= b.t_judge:
-        b.t_judge = s.t + EVERY - 1e-6
+    if s.t < b.t_judge:
+        return False
+    b.t_judge = s.t + EVERY - 1e-6
+    k = gyro_that_turns(s)
+    if k >= 0:
+        heal(s, GYRO + 2, k)
+        compass.forget(s)
+        clear(b)
+        return True
+    if b.fresh == 1:
         b.fresh = 0
         return judge(s, prm)
     return False
-
-
-@jit
-def follow(s: Any, dt: float) -> None:
-    """Let the bias of an axis whose ramp was named walk as fast as it was found to go."""
-    b = s.bank[0]
-    for a in range(len(b.slope)):
-        if b.slope[a] != 0.0:
-            if s.t > b.t_slope[a]:
-                b.slope[a] = 0.0
-            s.P[9 + a, 9 + a] += b.slope[a] * b.slope[a] * LAG * dt
 
 
 @jit
@@ -215,25 +209,6 @@ def learn_usual(b: Any, t: float) -> None:
         b.usual[g] += (RISE if b.waiting[g] > b.usual[g] else FALL) * (b.waiting[g] - b.usual[g])
         b.waiting[g] = min(b.peak[g], CAP)
         b.peak[g] = 0.0
-
-
-@jit
-def by_heading(s: Any, prm: Any, row: Vec, k: int, j: int, size: float) -> float:
-    """What the change of heading since onset ``k`` says for column ``j``: gain in twice the log likelihood over no fault.
-
-    The filter takes a compass for hardly better than its calibration; without turning no calibration error changes, so that the change
-    since the onset is known much better (`haltere.aids.compass`). It decides between faults but raises no alarm.
-    """
-    b = s.bank[0]
-    q = b.q[k]
-    same = s.q[0] * q[0] + s.q[1] * q[1] + s.q[2] * q[2] + s.q[3] * q[3]
-    turned = 2.0 * math.sqrt(max(0.0, 1.0 - same * same))
-    change = b.heading - b.heading_then[k]
-    turned = max(0.0, turned - abs(change))  # a gyro that fails turns the estimate, not the compass
-    wrong = prm.robust_calibration * turned / math.cos(s.field[1])
-    variance = prm.robust_heading * prm.robust_heading + wrong * wrong
-    left = change - size * (row[0] * b.x[0, j] + row[1] * b.x[1, j] + row[2] * b.x[2, j])
-    return min(max((change * change - left * left) / variance, -HEADING_SAYS), HEADING_SAYS)
 
 
 @jit
@@ -272,6 +247,9 @@ def weigh(s: Any, prm: Any) -> tuple[int, float]:
                     b.ratio, tilting = beyond, level
     if tilting < b.level[F_COMPASS]:
         b.ratio = 0.0
+    for g in range(F_ACCEL):
+        if b.beyond[g] > 0.5 and in_samples(s, g):
+            b.level[g] += SHOWN
     lead, ratio = 0, 0.0
     for g in range(N_FAMILIES):
         if b.level[g] > b.level[lead]:
@@ -315,9 +293,8 @@ def judge(s: Any, prm: Any) -> bool:
         b.alarm, b.t_seen = 1, s.t
     candidates, others = 1 << lead, 0
     top = b.level[lead]
-    seen = in_samples(s, lead)
     for g in range(N_FAMILIES):
-        margin = SEEN if seen and not in_samples(s, g) else max(MARGIN_ALIKE if alike(g, lead) else MARGIN, LINEAR * top)
+        margin = max(MARGIN_ALIKE if alike(g, lead) else MARGIN, LINEAR * top)
         if g != lead and top - b.level[g] < margin:
             candidates |= 1 << g
             others += 1
@@ -327,6 +304,7 @@ def judge(s: Any, prm: Any) -> bool:
         b.alarm = 2
         if lead < F_VELOCITY:
             tell(s, prm, E_SUSPECT, lead, candidates)
+            return heal_between(s, candidates)
     return False
 
 
@@ -364,24 +342,3 @@ def name(s: Any, prm: Any, g: int) -> bool:
         compass.forget(s)  # a tilt that was mended has turned the levelled heading
     clear(b)
     return True
-
-
-@jit
-def heal(s: Any, f: int, k: int) -> None:
-    """Take back what fault ``f`` since the onset of slot ``k`` has put into the state: x̂ <- x̂ + b̂ x, P <- P + σ² x xᵀ."""
-    b = s.bank[0]
-    j = f * SLOTS + k
-    size = b.num[j] / b.den[j]
-    variance = 1.0 / b.den[j] + LEFT * LEFT * size * size
-    n = s.P.shape[0]
-    for i in range(n):
-        s.dx[i] = size * b.x[i, j]
-    for i in range(n):
-        for c in range(n):
-            s.P[i, c] += variance * b.x[i, j] * b.x[c, j]
-    inject(s)
-    b.healed += 1
-    if f >= GYRO_RAMP and f < VELOCITY:
-        a = f - GYRO_RAMP
-        b.slope[a], b.t_slope[a] = abs(size), s.t + FOLLOWED
-    b.yaw = s.yaw_corrected

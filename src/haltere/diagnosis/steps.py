@@ -24,11 +24,12 @@ __all__ = ["DEATHS", "DROPOUT", "NOISE", "SATURATE", "STEP", "STUCK", "forget", 
 
 #: Samples of each half of a step; shortest and longest interval at which steps can be told from motion [s].
 HALF, SHORTEST, LONGEST = 6, 2e-4, 5.2e-3
-#: Memory of the differences' mean square where it falls and where it rises [s], from how many samples on it is known, and how far a lone one may move it.
+#: Memory of the differences' mean square where it falls and where it rises [s], from how many samples on it is known, and how far a
+#: lone one may move it.
 MEMORY, ALERT, WARM, LONE = 2.0, 0.5, 250, 9.0
 #: A step in sigma; what the other gyro axes may show of it, and the accelerometer [sigma]; how level the halves are (of 10 degrees of
 #: freedom), and by how much a step must fit better than a straight line, in variances.
-LARGE, ASIDE, QUIET, LEVEL, BETTER = 9.0, 0.4, 6.0, 2.3, 25.0
+LARGE, ASIDE, QUIET, LEVEL, BETTER = 9.0, 0.4, 6.0, 2.3, 18.0
 #: Square of a specific force beside the half before, of 3 degrees of freedom, that is a shock.
 SHOCK = 20.0
 #: After rest steps are not looked for during this time [s].

@@ -94,9 +94,13 @@ def bank(n: int) -> np.dtype[np.void]:
         (
             "ratio",
             "f8",
-        ),  # statistic of what may have tilted the attitude over its threshold, at the last judgement; 0 if a compass explains more
+        ),  # statistic over threshold of what may have tilted the attitude; 0 if a compass explains more
         ("slope", "f8", 6),  # of a ramp that was named, by axis, until when
         ("t_slope", "f8", 6),
         ("healed", "i8"),
+        ("t_turn", "f8"),  # of a compass that turns against the gyro: its onset, rate and duration when that was noticed
+        ("turn_rate", "f8"),
+        ("turn_lasted", "f8"),
+        ("turn", "f8"),
         ("step", STEPS),
     )

@@ -1,0 +1,78 @@
+"""What the compass says between faults: the change of heading since an onset, and a compass that turns because the gyro does. No alarm.
+
+A filter takes a compass for hardly better than its calibration, but without turning no calibration error changes, so that a change is
+known much better (`haltere.aids.compass`). A compass that turns against the gyro is a disturbance, or the gyro's vertical axis: a step in
+the raw rate of the same size and time says the gyro, and so does a turn that goes on at the same rate further than a disturbance swings.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+from haltere._jit import jit
+from haltere.aids import compass
+from haltere.aids.record import E_FAULT, NO_SENSOR, event_since
+from haltere.core.rotation import Vec
+from haltere.diagnosis.steps import shown
+from haltere.filter.signatures import GYRO, SLOTS
+
+__all__ = ["by_heading", "gyro_that_turns"]
+
+#: Most that the change of heading may say.
+SAYS = 40.0
+#: A turn that goes on: this far [rad], so many times as long as when it was noticed, at the same rate within this part, at least this fast.
+FAR, LONGER, SAME, FASTEST = math.radians(25.0), 2.0, 0.25, math.radians(2.0)
+#: From this part of a threshold on something may have tilted the attitude.
+TILTED = 0.35
+
+
+@jit
+def by_heading(s: Any, prm: Any, row: Vec, k: int, j: int, size: float) -> float:
+    """What the change of heading since onset ``k`` says for column ``j``: gain in twice the log likelihood over no fault."""
+    b = s.bank[0]
+    q = b.q[k]
+    same = s.q[0] * q[0] + s.q[1] * q[1] + s.q[2] * q[2] + s.q[3] * q[3]
+    turned = 2.0 * math.sqrt(max(0.0, 1.0 - same * same))
+    change = b.heading - b.heading_then[k]
+    turned = max(0.0, turned - abs(change))  # a gyro that fails turns the estimate, not the compass
+    wrong = prm.robust_calibration * turned / math.cos(s.field[1])
+    variance = prm.robust_heading * prm.robust_heading + wrong * wrong
+    left = change - size * (row[0] * b.x[0, j] + row[1] * b.x[1, j] + row[2] * b.x[2, j])
+    return min(max((change * change - left * left) / variance, -SAYS), SAYS)
+
+
+@jit
+def gyro_that_turns(s: Any) -> int:
+    """Slot of the onset of a fault of gyro z that turns the compass, -1 if there is none; its event is left, its size in ``b.turn``."""
+    b, c = s.bank[0], s.compass
+    if c.out != compass.OUT_TURN:
+        b.t_turn = -1.0
+        return -1
+    lasted = c.t_last - c.onset
+    if lasted < 0.3 or b.ratio > TILTED:  # a tilt turns the levelled heading, too
+        return -1
+    rate = (c.last - c.level) / lasted
+    first = b.t_turn != c.onset
+    if first:
+        b.t_turn, b.turn_rate, b.turn_lasted = c.onset, rate, lasted
+    step = first and shown(b, 2, -rate, c.onset - 0.6, c.onset + 0.4)
+    on = lasted > LONGER * b.turn_lasted and abs(c.last - c.level) > FAR and abs(rate) > FASTEST
+    if not step and not (on and abs(rate - b.turn_rate) < SAME * abs(rate)):
+        return -1
+    best, near = -1, 1e18
+    for k in range(len(b.live)):
+        if b.live[k] == 1 and abs(b.onset[k] - c.onset) < near:
+            best, near = k, abs(b.onset[k] - c.onset)
+    if best < 0 or near > 0.5 + 0.2 * lasted:
+        return -1
+    b.turn = -rate
+    n = s.n_events
+    event_since(s, s.t, b.onset[best], E_FAULT, NO_SENSOR, abs(c.last - c.level), FAR, GYRO + 2)
+    if s.n_events > n:
+        e = s.event[n]
+        e.seen, e.size, e.sd, e.candidates = s.t, -rate, 0.1 * abs(rate), 4
+    j = (GYRO + 2) * SLOTS + best
+    b.den[j] = 1.0 / (0.1 * rate * 0.1 * rate)
+    b.num[j] = -rate * b.den[j]
+    return best
