@@ -21,8 +21,9 @@ __all__ = ["by_heading", "gyro_that_turns"]
 
 #: Most that the change of heading may say.
 SAYS = 40.0
-#: A turn that goes on: this far [rad], so many times as long as when it was noticed, at the same rate within this part, at least this fast.
-FAR, LONGER, SAME, FASTEST = math.radians(25.0), 2.0, 0.25, math.radians(2.0)
+#: A turn that goes on: this far [rad], so many times as long as when it was noticed, at the same rate within this part, at least this fast:
+#: a field that creeps turns a compass slower, and not as far.
+FAR, LONGER, SAME, SLOWEST = math.radians(60.0), 2.0, 0.25, math.radians(4.0)
 #: From this part of a threshold on something may have tilted the attitude.
 TILTED = 0.35
 
@@ -57,7 +58,7 @@ def gyro_that_turns(s: Any) -> int:
     if first:
         b.t_turn, b.turn_rate, b.turn_lasted = c.onset, rate, lasted
     step = first and shown(b, 2, -rate, c.onset - 0.6, c.onset + 0.4)
-    on = lasted > LONGER * b.turn_lasted and abs(c.last - c.level) > FAR and abs(rate) > FASTEST
+    on = lasted > LONGER * b.turn_lasted and abs(c.last - c.level) > FAR and abs(rate) > SLOWEST
     if not step and not (on and abs(rate - b.turn_rate) < SAME * abs(rate)):
         return -1
     best, near = -1, 1e18

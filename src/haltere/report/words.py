@@ -85,9 +85,15 @@ def verdict(c: Context) -> Verdict:
     ill = list(dict.fromkeys(_unit_label(f) for f in found if base_name(f["stream"]) == f["stream"]))  # further units are not used
     compass = disturbances(solution.events)
     alone = compass and by_level["bad"] == ["magnetometer"] and not by_level["doubtful"] and compass[0]["t_onset"] > solution.t[0] + 2.0
-    worst = 2 if (by_level["bad"] and not alone) or broken else 1 if by_level["doubtful"] or lost or drifting or torn or ill or alone else 0
+    failed = [e for e in solution.events if e["sensor"] in ("gyro", "accel") and e["t_isolated"] is not None]
+    doubtful = by_level["doubtful"] or lost or drifting or torn or ill or alone or failed
+    worst = 2 if (by_level["bad"] and not alone) or broken else 1 if doubtful else 0
     if broken:
         headline = f"The filter broke down {count(len(broken), 'time')}: read what follows with that in mind."
+    elif failed:
+        axes = _list(list(dict.fromkeys(f"{sensor_label(e['sensor'])} {e['axis']}" for e in failed)))
+        healed = "its effect was taken back" if len(failed) == 1 else "their effects were taken back"
+        headline = f"An inertial sensor failed: {axes}, first at t = {failed[0]['t_onset']:.1f} s; {healed} as far as it is known."
     elif alone:
         times = f" {len(compass)} times" if len(compass) > 1 else ""
         headline = f"The compass was disturbed{times}, first at t = {compass[0]['t_onset']:.1f} s; the heading was held without it."
