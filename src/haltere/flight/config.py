@@ -289,7 +289,7 @@ KEYS: dict[str, Key] = {
     ),
     "diagnosis.false_alarms": _positive(0.035, "1/h", "Wanted rate of false alarms; lower finds faults later."),
     "diagnosis.gyro": Key(0.3 * DEG, "rad/s", "Change of a gyro bias that is no fault.", low=0.0),
-    "diagnosis.accel": Key(0.12, "m/s^2", "Change of an accelerometer bias that is no fault.", low=0.0),
+    "diagnosis.accel": Key(0.08, "m/s^2", "Change of an accelerometer bias that is no fault.", low=0.0),
     "imu.kind": _switch("instant", "An IMU sample is the value at its time, or the mean since the sample before.", ("instant", "mean")),
     "baro.temperature": Key(
         math.nan, "K", "Air temperature at the ground, scales pressure altitude. Default: standard atmosphere.", low=200.0, high=330.0
