@@ -16,6 +16,9 @@ __all__ = ["AID_RECORD", "COMPONENTS", "EVENTS", "REASONS", "SENSORS", "STATUSES
 GNSS_VELOCITY, GNSS_POSITION, BAROMETER, MAGNETOMETER, POWER, ZERO_VELOCITY, ZERO_RATE, FAKE_POSITION, FAKE_VELOCITY, YAW_BANK = (
     constant(i) for i in range(10)
 )
+#: Those that only the published quaternion filter (`wind-attitude`) has, beside some of the above; all but the first are queued.
+ACCELEROMETER, AIR_VANES, AIR_BODY, WIND, ROTORS = (constant(i) for i in range(10, 15))
+N_SENSORS = 15
 N_QUEUED = 5
 #: Sensor of an event that no sensor made.
 NO_SENSOR = constant(0)
@@ -23,6 +26,7 @@ NO_SENSOR = constant(0)
 NO_DETAIL = constant(0)
 SENSORS = (
     "gnss", "gnss", "barometer", "magnetometer", "power", "zero_velocity", "zero_rate", "fake_position", "fake_velocity", "gnss",
+    "accelerometer", "airdata", "airdata", "wind", "rotors",
 )  # fmt: skip
 
 COMPONENTS = (
@@ -43,16 +47,39 @@ COMPONENTS = (
     "field_east",
     "field_down",
     "field_north",
+    "down_x",
+    "down_y",
+    "down_z",
+    "field_x",
+    "field_y",
+    "field_z",
+    "air_x",
+    "air_y",
+    "air_z",
 )
 C_VEL, C_POS, C_ALTITUDE, C_HEADING, C_MAG, C_RATE, C_FIELD = (constant(i) for i in (0, 3, 6, 7, 8, 11, 14))
+C_DOWN, C_UNIT_FIELD, C_AIR = (constant(i) for i in (17, 20, 23))
 
 STATUSES = ("fused", "deweighted", "rejected", "held")
 FUSED, DEWEIGHTED, REJECTED, HELD = (constant(i) for i in range(4))
 
-REASONS = ("", "innovation", "timeout", "start", "field strength", "dip", "no horizontal field", "alignment", "distrusted", "disturbed")
+REASONS = (
+    "",
+    "innovation",
+    "timeout",
+    "start",
+    "field strength",
+    "dip",
+    "no horizontal field",
+    "alignment",
+    "distrusted",
+    "disturbed",
+    "acceleration",
+)
 R_NONE, R_INNOVATION, R_TIMEOUT, R_START, R_STRENGTH, R_DIP, R_HORIZONTAL, R_ALIGNMENT, R_DISTRUSTED, R_DISTURBED = (
     constant(i) for i in range(10)
 )
+R_ACCELERATION = constant(10)
 
 EVENTS = ("aligned", "reset", "diverged", "realigned", "gap", "recovered", "timeout", "disturb")
 E_ALIGNED, E_RESET, E_DIVERGED, E_REALIGNED, E_GAP, E_RECOVERED, E_TIMEOUT, E_DISTURBED = (constant(i) for i in range(8))

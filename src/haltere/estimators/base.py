@@ -11,11 +11,24 @@ import numpy as np
 from numpy.typing import NDArray
 
 from haltere._jit import as_records
-from haltere.aids.record import AID_RECORD, BAROMETER, GNSS_POSITION, GNSS_VELOCITY, MAGNETOMETER, POWER
+from haltere.aids.air import ENOUGH
+from haltere.aids.record import (
+    AID_RECORD,
+    AIR_VANES,
+    BAROMETER,
+    GNSS_POSITION,
+    GNSS_VELOCITY,
+    MAGNETOMETER,
+    N_SENSORS,
+    POWER,
+    WIND,
+)  # fmt: skip
 from haltere.core.earth import STANDARD_GRAVITY, gravity
 from haltere.errors import HaltereError, UsageError
-from haltere.estimators import step as kernels
+from haltere.estimators import quaternion_step
+from haltere.estimators.air import steady_wind, vanes
 from haltere.estimators.inputs import altitude_of, parameters
+from haltere.estimators.registry import kernels_of
 from haltere.flight import config as configuration
 from haltere.flight.config import Config
 from haltere.flight.corrections import calibrated, calibration
@@ -23,6 +36,7 @@ from haltere.flight.door import impossible_place, impossible_pressure
 from haltere.flight.names import nearest_column, nearest_stream
 from haltere.flight.schema import column as schema_column
 from haltere.strapdown.layout import CORE, layout
+from haltere.strapdown.quaternion import quaternion_layout
 
 __all__ = ["Estimator", "InitialState", "State", "new_state"]
 
@@ -34,6 +48,8 @@ _VALUES = {
     "barometer": ("pressure",),
     "magnetometer": ("mag_x", "mag_y", "mag_z"),
     "power": ("current",),
+    "airdata": ("airspeed", "aoa", "sideslip"),
+    "wind": ("wind_n", "wind_e", "wind_d", "sd"),
 }
 _ACCURACIES = ("h_acc", "h_acc", "v_acc", "s_acc", "s_acc", "s_acc")
 
@@ -99,7 +115,8 @@ class InitialState:
     q_nb, vel_n, pos_n, gyro_bias_b, accel_bias_b
         Nominal state, SI units.
     P
-        Covariance (n, n) in the order of `State.P`.
+        Covariance (n, n) in the order of `State.P`; of the published filter of `wind-attitude` that of the attitude error alone is used,
+        the first three rows and columns.
     baro_bias
         Barometer offset [m].
     """
@@ -117,7 +134,9 @@ class InitialState:
 def new_state(config: Config, initial: InitialState | None = None) -> NDArray[np.void]:
     """State record, one element, that has seen nothing yet."""
     offsets = 1 if config["baro.offset"] == "on" else 0, 3 if config["magnetometer.refine"] == "on" else 0
-    record = as_records(np.zeros(1, layout(*offsets, 1 if config.estimator == "two-stage" else 0)))
+    quaternion = config["wind_attitude.filter"] == "quaternion"
+    kind = quaternion_layout(N_SENSORS) if quaternion else layout(*offsets, 1 if config.estimator == "two-stage" else 0)
+    record = as_records(np.zeros(1, kind))
     record["q"][0, 0] = 1.0
     home = (config.number("home.lat"), config.number("home.lon"), config.number("home.alt"))
     record["gravity"] = STANDARD_GRAVITY
@@ -131,9 +150,39 @@ def new_state(config: Config, initial: InitialState | None = None) -> NDArray[np
     if not (math.isnan(dip) or math.isnan(strength)):
         record["field"][0, 1:] = dip, strength
         record["has_field"] = 1
+    if quaternion:
+        _published(record, config)
     if initial is not None:
-        _begin_from(record, initial)
+        (_begin_quaternion if quaternion else _begin_from)(record, initial)
     return record
+
+
+def _published(record: NDArray[np.void], config: Config) -> None:
+    """What the published filter knows from the start: the wind as given."""
+    record["x"][0, 0] = 1.0
+    record["t_gnss"] = record["t_rotors"] = -1e9
+    wind = steady_wind(config.values)
+    if wind is not None:
+        record["wind_v"][0], record["wind_r"], record["has_wind"] = wind, config.number("wind.sd") ** 2, 1
+    elif config["wind_attitude.rows"] == "printed":  # which have no wind in them
+        record["has_wind"] = 1
+
+
+def _begin_quaternion(record: NDArray[np.void], initial: InitialState) -> None:
+    """Attitude and the covariance of its error; the other states are not there."""
+    P = np.asarray(initial.P, dtype=np.float64)
+    if P.ndim != 2 or P.shape[0] != P.shape[1] or len(P) < 3:
+        raise HaltereError("an initial covariance of shape (3, 3), of the attitude error", f"{P.shape}", "initial state")
+    V = P[:3, :3]
+    if not np.allclose(V, V.T, rtol=1e-9, atol=1e-15) or np.linalg.eigvalsh(V).min() <= 0.0:
+        raise HaltereError("a symmetric positive covariance", "one that is not", "initial state")
+    q = np.asarray(initial.q_nb, dtype=np.float64)
+    if q.shape != (4,) or not np.isfinite(q).all() or not q.any():
+        raise HaltereError("4 finite numbers for q_nb", f"{q.tolist()}", "initial state")
+    record["t"] = record["t_block"] = record["t_aligned"] = _number(initial.t, "t", "initial state")
+    record["q"][0] = record["x"][0] = q / np.linalg.norm(q)
+    a, b, c = ((float(x), float(y), float(z)) for x, y, z in V)
+    quaternion_step.begin_at(record, (a, b, c))
 
 
 def _begin_from(record: NDArray[np.void], initial: InitialState) -> None:
@@ -173,7 +222,7 @@ class Estimator:
     Parameters
     ----------
     name
-        ``navigator``, ``ahrs`` or ``two-stage``.
+        ``navigator``, ``ahrs``, ``two-stage`` or ``wind-attitude``.
     config
         A complete `Config`, or a mapping of configuration keys to change. Home and field that are not given are taken from
         the first fix (origin) and from the first magnetometer samples (field); declination is then 0.
@@ -208,7 +257,8 @@ class Estimator:
             )  # fmt: skip
         self._calibration = calibration(self.config.values)
         self._S = new_state(self.config, initial)
-        self._stage = kernels.stage_of(self._S)
+        self._kernels = kernels_of(self._S)
+        self._stage = self._kernels.stage_of(self._S)
         self._prm = parameters(self.config)
         self._aids = as_records(np.empty(4096, AID_RECORD))
         self._now = np.zeros(11)
@@ -235,7 +285,7 @@ class Estimator:
         UsageError
             Not three numbers each.
         """
-        kernels.step(
+        self._kernels.step(
             self._S, self._prm, _number(t, "t", "Estimator.step"), _three(gyro, "gyro"), _three(accel, "accel"),
             _NO_ROWS, _NO_ROWS, self._aids, _NO_ROWS, self._stage,
         )  # fmt: skip
@@ -247,13 +297,13 @@ class Estimator:
         Parameters
         ----------
         sensor
-            ``gnss``, ``barometer``, ``magnetometer`` or ``power``.
+            ``gnss``, ``barometer``, ``magnetometer``, ``power``, ``airdata`` or ``wind``.
         t
             Time stamp [s]; it was valid at t minus the configured delay.
         values
             By column name as in the flight folder, or in order: gnss ``lat, lon, alt[, vel_n, vel_e, vel_d]`` (deg, m, m/s),
             barometer ``pressure`` [Pa], magnetometer ``mag_x, mag_y, mag_z`` [uT], to which a calibration (``magnetometer.*``) is applied,
-            power ``current`` [A].
+            power ``current`` [A], airdata ``airspeed`` [m/s], ``aoa``, ``sideslip`` [rad], wind ``wind_n, wind_e, wind_d, sd`` [m/s].
         variances
             Of the values in order, for gnss (lat, lon and alt in m^2); NaN, not positive or absent: as configured.
 
@@ -271,7 +321,7 @@ class Estimator:
         if sensor not in _VALUES:
             near = nearest_stream(str(sensor), _VALUES)
             raise UsageError(
-                "a sensor: gnss, barometer, magnetometer or power",
+                f"a sensor: {', '.join(_VALUES)}",
                 repr(sensor),
                 "Estimator.offer",
                 f"did you mean {near!r}?" if near else "",
@@ -290,6 +340,14 @@ class Estimator:
             return (
                 self._queue(POWER, t, (current, math.nan, math.nan), _NAN) if math.isfinite(current) else self._refuse(sensor, "not finite")
             )
+        if sensor == "airdata":
+            return self._offer_airdata(t, values)
+        if sensor == "wind":
+            w = _in_order(sensor, values, 2)
+            if not math.isfinite(w[0] + w[1]):
+                return self._refuse(sensor, "not finite")
+            sd = w[3] if w[3] > 0.0 else self.config.number("wind.sd")
+            return self._queue(WIND, t, (w[0], w[1], w[2]), (sd * sd, math.nan, math.nan))
         m = _in_order(sensor, values, 3)
         if not math.isfinite(m[0] + m[1] + m[2]):
             return self._refuse(sensor, "not finite")
@@ -337,8 +395,17 @@ class Estimator:
             return self._refuse("barometer", "not finite")
         return self._queue(BAROMETER, t, (h, math.nan, math.nan), _NAN)
 
+    def _offer_airdata(self, t: float, values: Sequence[float] | Mapping[str, float]) -> bool:
+        data = _in_order("airdata", values, 3)
+        if not math.isfinite(sum(data)):
+            return self._refuse("airdata", "no vane" if math.isfinite(data[0]) else "not finite")
+        if data[0] < ENOUGH * self.config.number("noise.airspeed"):
+            return self._refuse("airdata", "airspeed below three times its noise")
+        v, r = (a[0].tolist() for a in vanes(np.array([data]), self.config))
+        return self._queue(AIR_VANES, t, (v[0], v[1], v[2]), (r[0], r[1], r[2]))
+
     def _queue(self, kind: int, t: float, z: tuple[float, float, float], r: tuple[float, float, float]) -> bool:
-        return bool(kernels.offer(self._S, self._prm, kind, t, z, r) in (1, -1))
+        return bool(self._kernels.offer(self._S, self._prm, kind, t, z, r) in (1, -1))
 
     def _refuse(self, sensor: str, reason: str) -> bool:
         """Count a measurement that was not taken; always False."""
@@ -357,21 +424,25 @@ class Estimator:
             ("barometer", (BAROMETER,)),
             ("magnetometer", (MAGNETOMETER,)),
             ("power", (POWER,)),
+            ("airdata", (AIR_VANES,)),
+            ("wind", (WIND,)),
         ):
+            if max(kinds) >= self._S["aid"].shape[1]:
+                continue
             for field, reason in (("n_late", "later than the fusion horizon"), ("n_overflow", "queue full before the first IMU sample")):
                 if n := sum(int(self._S["aid"][field][0, k]) for k in kinds):
                     out.setdefault(sensor, {})[reason] = n
         return out
 
     def now(self) -> dict[str, FloatArray | float]:
-        """State predicted to the newest IMU sample: ``t``, ``q_nb`` (4,), ``vel_n`` (3,), ``pos_n`` (3,)."""
-        kernels.now(self._S, self._prm, self._now)
+        """State predicted to the newest IMU sample: ``t``, ``q_nb`` (4,), ``vel_n`` (3,), ``pos_n`` (3,); NaN what it does not hold."""
+        self._kernels.now(self._S, self._prm, self._now)
         x = self._now.copy()
         return {"t": float(x[0]), "q_nb": x[1:5], "vel_n": x[5:8], "pos_n": x[8:11]}
 
     def finish(self) -> State:
         """Move the fusion horizon to the newest IMU sample: the end of a flight."""
-        kernels.flush(self._S, self._prm, _NO_ROWS, _NO_ROWS, self._aids, _NO_ROWS, self._stage)
+        self._kernels.flush(self._S, self._prm, _NO_ROWS, _NO_ROWS, self._aids, _NO_ROWS, self._stage)
         return self._view
 
     def records(self) -> NDArray[np.void]:

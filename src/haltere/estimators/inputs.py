@@ -12,9 +12,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from haltere._jit import as_records, entry
-from haltere.aids.record import BAROMETER, GNSS_POSITION, GNSS_VELOCITY, MAGNETOMETER, POWER
+from haltere.aids.record import AIR_VANES, BAROMETER, GNSS_POSITION, GNSS_VELOCITY, MAGNETOMETER, POWER, ROTORS, WIND
 from haltere.core.earth import pressure_altitude
 from haltere.errors import UsageError
+from haltere.estimators.air import air_from_vanes, given_wind, rotor_lift, steady_wind
 from haltere.flight import config as configuration
 from haltere.flight.config import KEYS, Config
 from haltere.flight.corrections import mounted
@@ -106,6 +107,8 @@ def configure(
                 values[f"field.{key}"] = value
     if math.isnan(float(values["field.declination"])):
         values["field.declination"] = 0.0
+    if values["wind_attitude.filter"] == "quaternion":
+        values["wind_attitude.air"] = air_provider(checked, asked)
     return Config(estimator, preset, values)
 
 
@@ -125,7 +128,7 @@ def parameters(config: Config) -> NDArray[np.void]:
     for name in PARAMETERS.names or ():
         if name in ("horizon", "covariance_interval", "imu_mean"):
             continue
-        head = "two_stage" if name.startswith("two_stage_") else name.partition("_")[0]
+        head = next((h for h in ("two_stage", "wind_attitude") if name.startswith(f"{h}_")), name.partition("_")[0])
         record[name] = config.number(f"{head}.{name[len(head) + 1 :]}")
     record["imu_mean"] = config.number("imu.kind")
     record["horizon"] = horizon(config)
@@ -184,6 +187,8 @@ def measurements(flight: FlightLog, checked: Checked, config: Config) -> Measure
         current = power.get("current")
         value = np.column_stack([current, np.full((len(power), 2), np.nan)])
         parts.append((POWER, power.t, value, np.full_like(value, np.nan)))
+    if config["wind_attitude.filter"] == "quaternion":
+        parts += _wind_triangle(flight, checked, config)
     if not parts:
         return Measurements(np.empty(0, np.int64), np.empty(0), np.empty((0, 3)), np.empty((0, 3)))
     kind = np.concatenate([np.full(len(t), k, np.int64) for k, t, _, _ in parts])
@@ -191,3 +196,51 @@ def measurements(flight: FlightLog, checked: Checked, config: Config) -> Measure
     order = np.argsort(t, kind="stable")
     z, r = np.concatenate([p[2] for p in parts]), np.concatenate([p[3] for p in parts])
     return Measurements(kind[order], t[order], np.ascontiguousarray(z[order]), np.ascontiguousarray(r[order]))
+
+
+def _wind_triangle(flight: FlightLog, checked: Checked, config: Config) -> list[tuple[int, FloatArray, FloatArray, FloatArray]]:
+    """What the published filter of `wind-attitude` hears beside the others: air velocity, wind, rotor speeds; what is missing is told."""
+    parts: list[tuple[int, FloatArray, FloatArray, FloatArray]] = []
+    told, left_out = checked.warnings, checked.discarded
+    airdata = checked.streams.get("airdata")
+    if airdata is not None and config["aid.airdata"] == "on" and config["wind_attitude.air"] == "vanes":
+        air = air_from_vanes(airdata, config)
+        parts.append((AIR_VANES, air.t, air.v_b, air.r))
+        told += air.warnings
+        for reason, n in air.left_out.items():
+            left_out.setdefault("airdata", {})[reason] = n
+    wind = given_wind(checked.streams.get("wind"), config)
+    if wind is not None:
+        parts.append((WIND, wind.t, wind.wind_n, np.column_stack([wind.r, np.full((len(wind.t), 2), np.nan)])))
+    if config["wind_attitude.air"] == "drag":
+        lift = rotor_lift(flight, config)
+        if lift is not None:
+            nan = np.full((len(lift[0]), 3), np.nan)
+            parts.append((ROTORS, lift[0], np.column_stack([lift[1], nan[:, :2]]), nan))
+    if config["wind_attitude.air"] != "off":
+        lacks = [] if checked.streams.get("gnss") is not None and config["aid.gnss"] == "on" else ["velocity from GNSS"]
+        if wind is None and steady_wind(config.values) is None:
+            lacks.append("wind (keys wind.n and wind.e or wind.speed and wind.from, or a stream wind)")
+        if lacks:
+            told.append(f"wind triangle: no {' and no '.join(lacks)}; attitude is that of gravity and field alone")
+    return parts
+
+
+def air_provider(checked: Checked, config: Config) -> str:
+    """Where the published filter takes the velocity through the air from: ``wind_attitude.air`` with ``auto`` resolved.
+
+    Raises
+    ------
+    UsageError
+        Drag is asked for and its coefficient is not known.
+    """
+    word = str(config["wind_attitude.air"])
+    airdata, drag = checked.streams.get("airdata"), not math.isnan(config.number("drag.mu"))
+    if word == "auto":
+        whole = airdata is not None and all(np.isfinite(airdata.get(c)).any() for c in ("airspeed", "aoa", "sideslip"))
+        word = "vanes" if whole else "drag" if drag else "off"
+        if word == "off" and airdata is not None:
+            word = "vanes"  # which says what it lacks
+    if word == "drag" and not drag:
+        raise UsageError("drag.mu, the rotor drag over mass", "none", "wind_attitude.air=drag", "set drag.mu [1/s], 0.2 to 0.6")
+    return word

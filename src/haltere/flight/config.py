@@ -24,6 +24,7 @@ PRESETS: dict[str, tuple[str, ...]] = {
     "navigator": ("default",),
     "ahrs": ("default",),
     "two-stage": ("default", "as-corrected", "as-printed"),
+    "wind-attitude": ("default", "as-corrected", "as-printed"),
 }
 ESTIMATORS = tuple(PRESETS)
 
@@ -132,6 +133,25 @@ KEYS: dict[str, Key] = {
     "aid.fake_position": _switch("on", "Fake position while nothing else holds it."),
     "aid.yaw_bank": _switch("on", "Set yaw from GNSS velocity where it is unknown, or contradicted by it."),
     "aid.fake_velocity": _switch("off", "Fake zero velocity, always on in ahrs."),
+    "aid.airdata": _switch("on", "Use airspeed and vanes."),
+    "noise.airspeed": _positive(0.5, "m/s", "Airspeed, 1 sigma."),
+    "noise.aoa": _positive(2.0 * DEG, "rad", "Angle of attack, 1 sigma in a steady fast flow."),
+    "noise.sideslip": _positive(2.0 * DEG, "rad", "Sideslip angle, 1 sigma in a steady fast flow."),
+    "gate.airdata": _positive(5.0, "sigma", "Innovation gate of air data."),
+    "delay.airdata": _delay("The same for air data."),
+    "wind.n": Key(math.nan, "m/s", "Wind as given, where it blows to, north. Default: not given.", low=-100.0, high=100.0),
+    "wind.e": Key(math.nan, "m/s", "The same, east.", low=-100.0, high=100.0),
+    "wind.d": Key(0.0, "m/s", "The same, down.", low=-50.0, high=50.0),
+    "wind.speed": Key(math.nan, "m/s", "Wind as a station gives it, instead: its speed,", low=0.0, high=100.0),
+    "wind.from": Key(math.nan, "rad", "and where it comes from, clockwise from true north.", low=-6.2832, high=6.2832),
+    "wind.sd": _positive(1.0, "m/s", "1 sigma of each component of a given wind, gusts included."),
+    "drag.mu": _positive(math.nan, "1/s", "Rotor drag in hover at sea level over mass. Default: not known."),
+    "drag.c": Key(0.0, "1/m", "Body drag over mass.", low=0.0, high=10.0),
+    "drag.mu_sd": _positive(0.15, "1", "1 sigma of ln mu."),
+    "drag.offset_x": Key(0.0, "m/s^2", "Specific force along x without air flow.", low=-10.0, high=10.0),
+    "drag.offset_y": Key(0.0, "m/s^2", "The same along y.", low=-10.0, high=10.0),
+    "drag.density": _positive(1.0, "1", "Density of the air over that at sea level."),
+    "drag.hover_speed": _positive(math.nan, "rad/s", "Mean rotor speed in hover. Default: not known, thrust is taken from specific force."),
     "timeout.gnss": _positive(7.0, "s", "After this long without a fix that passes, GNSS is let in again by force, at the gate's edge."),
     "timeout.barometer": _positive(7.0, "s", "The same for the barometer."),
     "timeout.magnetometer": _positive(10.0, "s", "The same for the magnetometer."),
@@ -215,6 +235,36 @@ KEYS: dict[str, Key] = {
     "two_stage.height_sign": _switch(
         "minus", "Down position of a fix is minus the height above the origin; plus is a misprint of the source.", ("minus", "plus")
     ),
+    "wind_attitude.filter": _switch(
+        "error-state",
+        "The filter behind wind-attitude, as its preset says: the error-state filter of haltere with wind as a state, or the published one "
+        "of four states.",
+        ("error-state", "quaternion"),
+    ),
+    "wind_attitude.integrator": _switch(
+        "picard4",
+        "Step of the quaternion: Picard's approximations (published: the fourth), Runge-Kutta, or exact for a constant rate.",
+        ("picard1", "picard2", "picard3", "picard4", "rk4", "exp"),
+    ),
+    "wind_attitude.residual": _switch("nonlinear", "z - h(q), or Z - H X as (25) prints it.", ("nonlinear", "printed")),
+    "wind_attitude.rows": _switch("jacobian", "Rows 7 to 9 of H: of the wind triangle, or as (20) prints them.", ("jacobian", "printed")),
+    "wind_attitude.normalise": _switch(
+        "on", "Bring the quaternion back to length one after each step: its covariance too (on), or not (length).", ("off", "length", "on")
+    ),
+    "wind_attitude.angles": _switch(
+        "atan2", "Roll and yaw given out: over the whole circle, or by the arc tangents of (3).", ("atan2", "arctan")
+    ),
+    "wind_attitude.accel": _switch("on", "Take specific force for gravity."),
+    "wind_attitude.force": _positive(1.0, "m/s^2", "Only where its size differs from gravity by less than this."),
+    "wind_attitude.acceleration": _positive(
+        1.5, "m/s^2", "And only where GNSS velocity, if there is any, shows an acceleration below this."
+    ),
+    "wind_attitude.gate": _positive(1e6, "sigma", "Innovation gate of gravity, joint over the components."),
+    "wind_attitude.air": _switch(
+        "auto",
+        "Where the velocity through the air is from: vanes (stream airdata), drag (specific force over drag.*), or what there is.",
+        ("off", "vanes", "drag", "auto"),
+    ),
     "imu.kind": _switch("instant", "An IMU sample is the value at its time, or the mean since the sample before.", ("instant", "mean")),
     "baro.temperature": Key(
         math.nan, "K", "Air temperature at the ground, scales pressure altitude. Default: standard atmosphere.", low=200.0, high=330.0
@@ -258,6 +308,7 @@ GROUPS: dict[str, tuple[str, ...]] = {
 }
 
 _TWO_STAGE = tuple(key for key in KEYS if key.startswith("two_stage."))
+_WIND_ATTITUDE = tuple(key for key in KEYS if key.startswith("wind_attitude."))
 #: What an estimator sets differently from the defaults above.
 _OVERRIDES: dict[str, dict[str, Value]] = {
     "navigator": {},
@@ -269,6 +320,7 @@ _OVERRIDES: dict[str, dict[str, Value]] = {
         "aid.zero_velocity": "off", "aid.zero_rate": "off", "aid.yaw_bank": "off", "aid.compass_watch": "off",
         "aid.motor_field": "off", "two_stage.radial": 0.05, "two_stage.memory": 10.0,
     },
+    "wind-attitude": {},
 }  # fmt: skip
 _NO_GATE = 1e6
 #: What a preset of an estimator sets differently from its `default`. The source has no innovation tests.
@@ -283,11 +335,27 @@ _PRESET_OVERRIDES["two-stage", "as-printed"] = _PRESET_OVERRIDES["two-stage", "a
     "two_stage.index": "algebraic",
     "two_stage.height_sign": "plus",
 }
+_PRESET_OVERRIDES["wind-attitude", "as-corrected"] = {
+    "wind_attitude.filter": "quaternion", "aid.magnetometer": "3-axis", "gate.magnetometer": _NO_GATE, "gate.airdata": _NO_GATE,
+    "noise.field": 0.0,
+}  # fmt: skip
+_PRESET_OVERRIDES["wind-attitude", "as-printed"] = _PRESET_OVERRIDES["wind-attitude", "as-corrected"] | {
+    "wind_attitude.residual": "printed", "wind_attitude.rows": "printed", "wind_attitude.normalise": "off",
+    "wind_attitude.angles": "arctan", "wind_attitude.force": _NO_GATE, "wind_attitude.acceleration": _NO_GATE,
+}  # fmt: skip
+#: Where the keys begin that the published filter of wind-attitude is told; noise and delays a flight may tell of any sensor.
+_QUATERNION = (
+    "noise.", "delay.", "gate.magnetometer", "gate.airdata", "aid.gnss", "aid.magnetometer", "aid.airdata", "timeout.magnetometer",
+    "timeout.imu", "field.", "home.", "init.tilt_", "init.yaw_", "init.accel_bias", "rest.gyro", "rest.gravity", "imu.kind", "unit.",
+    "axes.", "magnetometer.offset_", "magnetometer.matrix_", "magnetometer.load", "wind.", "drag.", "wind_attitude.",
+)  # fmt: skip
 #: Keys that an estimator does not have: changing them would change nothing, or make it another one.
 _FIXED: dict[str, tuple[str, ...]] = {
-    "navigator": _TWO_STAGE,
-    "ahrs": (*_OVERRIDES["ahrs"], *_TWO_STAGE),
+    "navigator": (*_TWO_STAGE, *_WIND_ATTITUDE),
+    "ahrs": (*_OVERRIDES["ahrs"], *_TWO_STAGE, *_WIND_ATTITUDE),
+    "wind-attitude": (*_TWO_STAGE, "wind_attitude.filter"),
     "two-stage": (
+        *_WIND_ATTITUDE,
         "aid.barometer",
         "baro.offset",
         "aid.fake_velocity",
@@ -305,11 +373,20 @@ _FIXED: dict[str, tuple[str, ...]] = {
         "robust.calibration",
     ),
 }
+#: Further ones by preset.
+_FIXED_PRESET: dict[tuple[str, str], tuple[str, ...]] = {
+    ("wind-attitude", "default"): _WIND_ATTITUDE,
+    **{("wind-attitude", preset): tuple(k for k in KEYS if not k.startswith(_QUATERNION)) for preset in ("as-corrected", "as-printed")},
+}
 #: Words of a switch that an estimator does not have.
 _LACKS: dict[str, dict[str, tuple[str, ...]]] = {
     "navigator": {"aid.magnetometer": ("orthonormal",)},
     "ahrs": {"aid.magnetometer": ("orthonormal",)},
     "two-stage": {"aid.magnetometer": ("heading", "3-axis")},
+    "wind-attitude": {"aid.magnetometer": ("orthonormal",)},
+}
+_LACKS_PRESET: dict[tuple[str, str], dict[str, tuple[str, ...]]] = {
+    ("wind-attitude", preset): {"aid.magnetometer": ("heading", "orthonormal")} for preset in ("as-corrected", "as-printed")
 }
 
 
@@ -400,14 +477,16 @@ def resolve(estimator: str = "navigator", preset: str = "default", overrides: Ma
         Unknown estimator, preset or key (with the nearest name), a value out of bounds, or a key the estimator lacks.
     """
     values = defaults(estimator, preset)
+    fixed = (*_FIXED[estimator], *_FIXED_PRESET.get((estimator, preset), ()))
+    lacks = _LACKS[estimator] | _LACKS_PRESET.get((estimator, preset), {})
     for key, value in (overrides or {}).items():
         for name in GROUPS.get(key, (key,)):
             checked = _check(name, value, where)
             same = checked == values[name] or (checked != checked and values[name] != values[name])
-            if name in _FIXED[estimator] and not same:
+            if name in fixed and not same:
                 raise UsageError(f"a key that {estimator} has", repr(name), where, f"{estimator} keeps it at {values[name]}")
-            if checked in _LACKS[estimator].get(name, ()):
-                left = [w for w in KEYS[name].words if w not in _LACKS[estimator][name]]
+            if checked in lacks.get(name, ()):
+                left = [w for w in KEYS[name].words if w not in lacks[name]]
                 raise UsageError(f"{name} of {estimator} to be {' or '.join(left)}", repr(checked), where)
             values[name] = checked
     if estimator == "two-stage" and not float(values["two_stage.k1"]) < float(values["two_stage.k2"]):

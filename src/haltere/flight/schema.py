@@ -133,6 +133,12 @@ STREAMS: dict[str, StreamSchema] = {
             ),
             ("t",),
         ),
+        StreamSchema(
+            "wind",
+            "wind as given, where it blows to",
+            (T, *_ned("wind", "m/s", "velocity of the air over ground (blowing to)"), Column("sd", "m/s", "", "1 sigma of a component")),
+            ("t", "wind_n", "wind_e"),
+        ),
         StreamSchema("rotors", "rotor speeds and commands: speed_0 ... [rad/s], command_0 ... [0-1]", (T,), ("t",)),
         StreamSchema(
             "power",
