@@ -154,7 +154,7 @@ def fuse_drag(s: Any, prm: Any, aids: Any, f: Vec) -> None:
     for i in range(3):
         s.f_block[i] += f[i]
     span = s.t - s.t_block
-    if span < BLOCK:
+    if span < BLOCK - 1e-6:
         return
     k = 1.0 / s.n_block
     mean = (k * s.f_block[0] - prm.drag_offset_x, k * s.f_block[1] - prm.drag_offset_y, k * s.f_block[2])
