@@ -17,7 +17,8 @@ from scipy.linalg import expm
 import haltere
 import wind_attitude_oracle as oracle
 from haltere._jit import COMPILED
-from haltere.aids import air, vectors
+from haltere.aids import air_vector as air
+from haltere.aids import vectors
 from haltere.core import picard
 from haltere.core.rotation import quat_mul
 from haltere.errors import UsageError

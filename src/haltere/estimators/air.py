@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from haltere._jit import entry
-from haltere.aids.air import ENOUGH, from_drag, from_vanes
+from haltere.aids.air_vector import ENOUGH, from_drag, from_vanes
 from haltere.errors import UsageError
 from haltere.flight.config import Config
 from haltere.flight.log import FlightLog, Stream

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from haltere._jit import as_records
-from haltere.aids.air import ENOUGH
+from haltere.aids.air_vector import ENOUGH
 from haltere.aids.record import (
     AID_RECORD,
     AIR_VANES,

@@ -9,7 +9,7 @@ import math
 from typing import Any
 
 from haltere._jit import jit
-from haltere.aids import air, vectors
+from haltere.aids import air_vector, vectors
 from haltere.aids.fusing import judge
 from haltere.aids.gnss import velocity_variance
 from haltere.aids.record import (
@@ -137,7 +137,7 @@ def fuse_air(s: Any, prm: Any, aids: Any, t: float, kind: int, z: Vec, r: Vec) -
     old = (s.t - s.t_gnss) * AGE_ACCELERATION
     more = s.wind_r + old * old
     T = vectors.turned_covariance(quat_unit(x), (s.gnss_r[0] + more, s.gnss_r[1] + more, s.gnss_r[2] + more))
-    B = air.air_covariance(z, r) if kind == AIR_VANES else ((r[0], 0.0, 0.0), (0.0, r[1], 0.0), (0.0, 0.0, r[2]))
+    B = air_vector.air_covariance(z, r) if kind == AIR_VANES else ((r[0], 0.0, 0.0), (0.0, r[1], 0.0), (0.0, 0.0, r[2]))
     R = (
         (T[0][0] + B[0][0], T[0][1] + B[0][1], T[0][2] + B[0][2]),
         (T[1][0] + B[1][0], T[1][1] + B[1][1], T[1][2] + B[1][2]),
@@ -165,7 +165,7 @@ def fuse_drag(s: Any, prm: Any, aids: Any, f: Vec) -> None:
     if lift < 0.3:  # rotors that hardly turn have no drag to speak of
         return
     sd = math.sqrt(prm.noise_accel * prm.noise_accel / span + prm.init_accel_bias * prm.init_accel_bias)
-    v, r = air.from_drag(mean, prm.drag_mu, prm.drag_c, lift, prm.drag_density, sd, prm.drag_mu_sd)
+    v, r = air_vector.from_drag(mean, prm.drag_mu, prm.drag_c, lift, prm.drag_density, sd, prm.drag_mu_sd)
     fuse_air(s, prm, aids, s.t, AIR_BODY, v, r)
 
 
