@@ -60,36 +60,29 @@ def air_covariance(v: Vec, r: Vec) -> Mat:
 
 
 @jit
-def from_drag(f: Vec, mu: float, c: float, lift: float, density: float, sd_force: float, sd_mu: float) -> tuple[Vec, Vec]:
-    """Air velocity along body x and y whose drag is the specific force there: -(a + k |v|) v = f_xy.
-
-    a = μ sqrt(ρ/ρ0) sqrt(T/g) is the rotors' (linear) part, k = c ρ/ρ0 the body's. |v| is taken in the plane: z is not known.
+def from_drag(f: Vec, mu: float, c: float, sd_force: float, sd_mu: float) -> tuple[Vec, Vec]:
+    """Air velocity along body x and y whose drag is the specific force there: -(µ + c |v|) v = f_xy, |v| in the plane, z not known.
 
     Parameters
     ----------
     f
         Specific force without accelerometer bias and drag offset [m/s^2].
     mu, c
-        Coefficients [1/s, 1/m] in hover at sea level.
-    lift
-        sqrt(T/g), T the thrust per mass: 1 in hover; as well the rotors' speed over that in hover.
-    density
-        ρ/ρ0.
+        Coefficients as they are here and now [1/s, 1/m], see `haltere.aids.drag`.
     sd_force
         1 sigma of the force, of its bias too [m/s^2].
     sd_mu
-        1 sigma of ln μ.
+        1 sigma of ln µ.
 
     Returns
     -------
     tuple
-        v = (u, v, NaN) and variances along the body's axes: those of the force over the slope of the drag, and of μ.
+        v = (u, v, NaN) and variances along the body's axes: those of the force over the slope of the drag, and of µ.
     """
-    a, k = mu * math.sqrt(density) * lift, c * density
     size = math.sqrt(f[0] * f[0] + f[1] * f[1])
-    speed = 2.0 * size / (a + math.sqrt(a * a + 4.0 * k * size))
-    slope = a + k * speed
+    speed = 2.0 * size / (mu + math.sqrt(mu * mu + 4.0 * c * size))
+    slope = mu + c * speed
     v = (-f[0] / slope, -f[1] / slope, math.nan)
     r = sd_force * sd_force / (slope * slope)
-    s = a * sd_mu / (a + 2.0 * k * speed)
+    s = mu * sd_mu / (mu + 2.0 * c * speed)
     return v, (r + v[0] * v[0] * s * s, r + v[1] * v[1] * s * s, math.nan)

@@ -11,71 +11,40 @@ from haltere._jit import constant, jit
 
 __all__ = ["AID_RECORD", "COMPONENTS", "EVENTS", "REASONS", "SENSORS", "STATUSES", "event", "event_since", "record"]
 
-#: Sensor codes, and indices of the filter's memory of each sensor. The first five arrive from outside and are queued; the last
-#: is the bank of yaw hypotheses, which speaks of GNSS velocity.
-GNSS_VELOCITY, GNSS_POSITION, BAROMETER, MAGNETOMETER, POWER, ZERO_VELOCITY, ZERO_RATE, FAKE_POSITION, FAKE_VELOCITY, YAW_BANK = (
-    constant(i) for i in range(10)
-)
-#: Those that only the published quaternion filter (`wind-attitude`) has, beside some of the above; all but the first are queued.
-ACCELEROMETER, AIR_VANES, AIR_BODY, WIND, ROTORS = (constant(i) for i in range(10, 15))
-N_SENSORS = 15
-N_QUEUED = 5
+#: Sensor codes, and indices of the filter's memory of each sensor. The first ones arrive from outside and are queued, the next are made
+#: by the filter itself, of what is measured and then (from `FAKE_POSITION` on) of what is assumed; the last is the bank of yaw
+#: hypotheses, which speaks of GNSS velocity.
+GNSS_VELOCITY, GNSS_POSITION, BAROMETER, MAGNETOMETER, POWER, ROTORS, AIRSPEED, VANES, WIND, ATTITUDE = (constant(i) for i in range(10))
+ZERO_VELOCITY, ZERO_RATE, DRAG, NO_SIDESLIP, FAKE_POSITION, FAKE_VELOCITY, YAW_BANK = (constant(i) for i in range(10, 17))
+#: Only the published quaternion filter (`wind-attitude`) hears gravity from the accelerometer; of `VANES` and `DRAG` it hears vectors.
+ACCELEROMETER = constant(17)
+N_QUEUED = 10
 #: Sensor of an event that no sensor made.
 NO_SENSOR = constant(0)
 #: Detail of an event that has none.
 NO_DETAIL = constant(0)
 SENSORS = (
-    "gnss", "gnss", "barometer", "magnetometer", "power", "zero_velocity", "zero_rate", "fake_position", "fake_velocity", "gnss",
-    "accelerometer", "airdata", "airdata", "wind", "rotors",
+    "gnss", "gnss", "barometer", "magnetometer", "power", "rotors", "airdata", "airdata", "wind", "attitude",
+    "zero_velocity", "zero_rate", "drag", "no_sideslip", "fake_position", "fake_velocity", "gnss",
+    "accelerometer",
 )  # fmt: skip
 
 COMPONENTS = (
-    "vel_n",
-    "vel_e",
-    "vel_d",
-    "pos_n",
-    "pos_e",
-    "pos_d",
-    "altitude",
-    "heading",
-    "mag_x",
-    "mag_y",
-    "mag_z",
-    "rate_x",
-    "rate_y",
-    "rate_z",
-    "field_east",
-    "field_down",
-    "field_north",
-    "down_x",
-    "down_y",
-    "down_z",
-    "field_x",
-    "field_y",
-    "field_z",
-    "air_x",
-    "air_y",
-    "air_z",
-)
+    "vel_n", "vel_e", "vel_d", "pos_n", "pos_e", "pos_d", "altitude", "heading", "mag_x", "mag_y", "mag_z", "rate_x", "rate_y", "rate_z",
+    "field_east", "field_down", "field_north", "airspeed", "aoa", "sideslip", "drag_x", "drag_y", "wind_n", "wind_e", "wind_d",
+    "attitude_x", "attitude_y", "attitude_z", "down_x", "down_y", "down_z", "field_x", "field_y", "field_z", "air_x", "air_y", "air_z",
+)  # fmt: skip
 C_VEL, C_POS, C_ALTITUDE, C_HEADING, C_MAG, C_RATE, C_FIELD = (constant(i) for i in (0, 3, 6, 7, 8, 11, 14))
-C_DOWN, C_UNIT_FIELD, C_AIR = (constant(i) for i in (17, 20, 23))
+C_AIRSPEED, C_AOA, C_SIDESLIP, C_DRAG, C_WIND, C_ATTITUDE = (constant(i) for i in (17, 18, 19, 20, 22, 25))
+C_DOWN, C_UNIT_FIELD, C_AIR = (constant(i) for i in (28, 31, 34))
 
 STATUSES = ("fused", "deweighted", "rejected", "held")
 FUSED, DEWEIGHTED, REJECTED, HELD = (constant(i) for i in range(4))
 
 REASONS = (
-    "",
-    "innovation",
-    "timeout",
-    "start",
-    "field strength",
-    "dip",
-    "no horizontal field",
-    "alignment",
-    "distrusted",
-    "disturbed",
+    "", "innovation", "timeout", "start", "field strength", "dip", "no horizontal field", "alignment", "distrusted", "disturbed",
     "acceleration",
-)
+)  # fmt: skip
 R_NONE, R_INNOVATION, R_TIMEOUT, R_START, R_STRENGTH, R_DIP, R_HORIZONTAL, R_ALIGNMENT, R_DISTRUSTED, R_DISTURBED = (
     constant(i) for i in range(10)
 )

@@ -16,9 +16,10 @@ from numpy.typing import NDArray
 
 from haltere._jit import entry
 from haltere.aids.air_vector import ENOUGH, from_drag, from_vanes
+from haltere.aids.drag import LEAST_THRUST
 from haltere.errors import UsageError
 from haltere.flight.config import Config
-from haltere.flight.log import FlightLog, Stream
+from haltere.flight.log import Stream
 
 __all__ = [
     "AirVelocity",
@@ -26,7 +27,6 @@ __all__ = [
     "air_from_drag",
     "air_from_vanes",
     "given_wind",
-    "rotor_lift",
     "station_wind",
     "steady_wind",
     "vanes",
@@ -75,9 +75,9 @@ def _vanes(data: Any, sd: float, sd_aoa: float, sd_sideslip: float, v: Any, r: A
 
 
 @entry
-def _drag(f: Any, lift: Any, mu: float, c: float, density: float, sd: float, sd_mu: float, v: Any, r: Any) -> None:
+def _drag(f: Any, mu: Any, c: float, sd: float, sd_mu: float, v: Any, r: Any) -> None:
     for i in range(len(f)):
-        a, b = from_drag((f[i, 0], f[i, 1], f[i, 2]), mu, c, lift[i], density, sd, sd_mu)
+        a, b = from_drag((f[i, 0], f[i, 1], f[i, 2]), mu[i], c, sd, sd_mu)
         for j in range(3):
             v[i, j], r[i, j] = a[j], b[j]
 
@@ -113,48 +113,35 @@ def air_from_vanes(stream: Stream, config: Config) -> AirVelocity:
     return AirVelocity(stream.t[fast], v, r, "air", {k: n for k, n in left_out.items() if n}, warnings)
 
 
-def air_from_drag(
-    t: FloatArray, accel_b: FloatArray, config: Config, gravity: float, lift: FloatArray | None = None, span: float = 0.1
-) -> AirVelocity:
+def air_from_drag(t: FloatArray, accel_b: FloatArray, config: Config, gravity: float, density: float, span: float = 0.1) -> AirVelocity:
     """Provider (b): what the drag of rotors and body says of the flow along x and y, from specific force in blocks of ``span`` [s].
 
-    The published filter does the same inside, sample by sample (``wind_attitude.air=drag``).
+    The published filter does the same inside, sample by sample (``wind_attitude.air=drag``), with rotor speeds where it hears them; here
+    thrust is specific force along z.
 
     Parameters
     ----------
     t, accel_b
         Times (n,) and specific force (n, 3) [m/s^2].
     config
-        Keys ``drag.*``, ``noise.accel``, ``init.accel_bias``.
+        Keys ``drag.*``, ``noise.drag``, ``init.accel_bias``.
     gravity
         [m/s^2].
-    lift
-        Rotor speed over that in hover at the same times (n,); without it from specific force along z.
-
-    Raises
-    ------
-    UsageError
-        ``drag.mu`` is not known.
+    density
+        Of the air, over that of the standard atmosphere at sea level.
     """
-    if math.isnan(config.number("drag.mu")):
-        raise UsageError("drag.mu, the rotor drag over mass", "none", "velocity through the air from drag", "set drag.mu [1/s], 0.2 to 0.6")
     slot = np.floor((t - t[0]) / span + 1e-9).astype(np.int64)
-    edges = np.r_[np.flatnonzero(np.r_[True, np.diff(slot) > 0])]
+    edges = np.flatnonzero(np.r_[True, np.diff(slot) > 0])
     counts = np.diff(np.r_[edges, len(t)])
     mean = np.add.reduceat(accel_b, edges) / counts[:, None]
-    mean[:, 0] -= config.number("drag.offset_x")
-    mean[:, 1] -= config.number("drag.offset_y")
-    up = np.sqrt(np.maximum(-mean[:, 2], 0.0) / gravity) if lift is None else np.add.reduceat(lift, edges) / counts
-    turning = up >= 0.3
-    sd = math.hypot(config.number("noise.accel") / math.sqrt(span), config.number("init.accel_bias"))
-    v, r = np.empty((int(turning.sum()), 3)), np.empty((int(turning.sum()), 3))
-    _drag(
-        np.ascontiguousarray(mean[turning]), np.ascontiguousarray(up[turning]), config.number("drag.mu"), config.number("drag.c"),
-        config.number("drag.density"), sd, config.number("drag.mu_sd"), v, r,
-    )  # fmt: skip
-    last = edges + counts - 1
-    left_out = {"rotors slow": int((~turning).sum())} if not turning.all() else {}
-    return AirVelocity(t[last][turning], v, r, "body", left_out)
+    turning = -mean[:, 2] >= LEAST_THRUST * gravity
+    f = np.ascontiguousarray(mean[turning])
+    mu = config.number("drag.mu") * np.sqrt(-density * f[:, 2] / gravity)
+    sd = float(np.linalg.norm([config.number(k) for k in ("noise.drag", "init.accel_bias", "drag.offset_sd")]))
+    v, r = np.empty_like(f), np.empty_like(f)
+    _drag(f, mu, config.number("drag.c") * density, sd, config.number("drag.mu_sd"), v, r)
+    last = (edges + counts - 1)[turning]
+    return AirVelocity(t[last], v, r, "body", {} if turning.all() else {"rotors slow": int((~turning).sum())})
 
 
 def station_wind(speed: Any, direction_from: Any) -> tuple[Any, Any]:
@@ -181,23 +168,12 @@ def steady_wind(values: Mapping[str, Any]) -> tuple[float, float, float] | None:
 
 
 def given_wind(stream: Stream | None, config: Config) -> GivenWind | None:
-    """Provider (c), table: the stream ``wind``, held from each row to the next. ``wind.sd`` where a row has no accuracy."""
+    """Provider (c), table: the stream ``wind``, held from each row to the next. ``noise.given_wind`` where a row has no accuracy."""
     if stream is None:
         return None
     w = np.column_stack([stream.get(f"wind_{a}") for a in "ned"])
     there = np.asarray(np.isfinite(w[:, :2]).all(axis=1))
     w[:, 2] = np.where(np.isfinite(w[:, 2]), w[:, 2], 0.0)
     sd = stream.get("sd")
-    sd = np.where(sd > 0.0, sd, config.number("wind.sd"))
+    sd = np.where(sd > 0.0, sd, config.number("noise.given_wind"))
     return GivenWind(stream.t[there], w[there], sd[there] ** 2)
-
-
-def rotor_lift(flight: FlightLog, config: Config) -> tuple[FloatArray, FloatArray] | None:
-    """Times and mean rotor speed over that in hover (``drag.hover_speed``); None where either is not known."""
-    rotors, hover = flight.get("rotors"), config.number("drag.hover_speed")
-    names = [c for c in rotors.names if c.startswith("speed_")] if rotors is not None else []
-    if rotors is None or not names or math.isnan(hover):
-        return None
-    mean = np.column_stack([rotors[c] for c in names]).mean(axis=1)
-    there = np.isfinite(mean) & np.isfinite(rotors.t)
-    return rotors.t[there], mean[there] / hover

@@ -14,20 +14,22 @@ from haltere._jit import as_records
 from haltere.aids.air_vector import ENOUGH
 from haltere.aids.record import (
     AID_RECORD,
-    AIR_VANES,
+    AIRSPEED,
+    ATTITUDE,
     BAROMETER,
     GNSS_POSITION,
     GNSS_VELOCITY,
     MAGNETOMETER,
-    N_SENSORS,
     POWER,
+    ROTORS,
+    VANES,
     WIND,
-)  # fmt: skip
+)
 from haltere.core.earth import STANDARD_GRAVITY, gravity
 from haltere.errors import HaltereError, UsageError
 from haltere.estimators import quaternion_step
 from haltere.estimators.air import steady_wind, vanes
-from haltere.estimators.inputs import altitude_of, parameters
+from haltere.estimators.inputs import altitude_of, parameters, rotation_vector
 from haltere.estimators.registry import kernels_of
 from haltere.flight import config as configuration
 from haltere.flight.config import Config
@@ -50,6 +52,8 @@ _VALUES = {
     "power": ("current",),
     "airdata": ("airspeed", "aoa", "sideslip"),
     "wind": ("wind_n", "wind_e", "wind_d", "sd"),
+    "attitude": ("q_w", "q_x", "q_y", "q_z"),
+    "rotors": (),
 }
 _ACCURACIES = ("h_acc", "h_acc", "v_acc", "s_acc", "s_acc", "s_acc")
 
@@ -133,10 +137,8 @@ class InitialState:
 
 def new_state(config: Config, initial: InitialState | None = None) -> NDArray[np.void]:
     """State record, one element, that has seen nothing yet."""
-    offsets = 1 if config["baro.offset"] == "on" else 0, 3 if config["magnetometer.refine"] == "on" else 0
     quaternion = config["wind_attitude.filter"] == "quaternion"
-    kind = quaternion_layout(N_SENSORS) if quaternion else layout(*offsets, 1 if config.estimator == "two-stage" else 0)
-    record = as_records(np.zeros(1, kind))
+    record = as_records(np.zeros(1, quaternion_layout() if quaternion else layout(**_sizes(config))))
     record["q"][0, 0] = 1.0
     home = (config.number("home.lat"), config.number("home.lon"), config.number("home.alt"))
     record["gravity"] = STANDARD_GRAVITY
@@ -160,7 +162,7 @@ def new_state(config: Config, initial: InitialState | None = None) -> NDArray[np
 def _published(record: NDArray[np.void], config: Config) -> None:
     """What the published filter knows from the start: the wind as given."""
     record["x"][0, 0] = 1.0
-    record["t_gnss"] = record["t_rotors"] = -1e9
+    record["t_gnss"] = record["air"]["t_rotors"] = -1e9
     wind = steady_wind(config.values)
     if wind is not None:
         record["wind_v"][0], record["wind_r"], record["has_wind"] = wind, config.number("wind.sd") ** 2, 1
@@ -183,6 +185,20 @@ def _begin_quaternion(record: NDArray[np.void], initial: InitialState) -> None:
     record["q"][0] = record["x"][0] = q / np.linalg.norm(q)
     a, b, c = ((float(x), float(y), float(z)) for x, y, z in V)
     quaternion_step.begin_at(record, (a, b, c))
+
+
+def _sizes(config: Config) -> dict[str, int]:
+    """Number of optional states of each kind, as `haltere.strapdown.layout.layout` takes them."""
+    drag, airdata = config["aid.drag"] == "on", config["aid.airdata"] == "on"
+    vanes = airdata and config["aid.vanes"] == "on"
+    return {
+        "baro": 1 if config["baro.offset"] == "on" else 0,
+        "mag": 3 if config["magnetometer.refine"] == "on" else 0,
+        "stages": 1 if config.estimator == "two-stage" else 0,
+        "wind": (3 if vanes and not drag else 2) if drag or airdata else 0,
+        "drag": 4 if drag else 0,
+        "vane": (3 if vanes else 1) if airdata else 0,
+    }
 
 
 def _begin_from(record: NDArray[np.void], initial: InitialState) -> None:
@@ -297,13 +313,14 @@ class Estimator:
         Parameters
         ----------
         sensor
-            ``gnss``, ``barometer``, ``magnetometer``, ``power``, ``airdata`` or ``wind``.
+            ``gnss``, ``barometer``, ``magnetometer``, ``power``, ``rotors``, ``airdata``, ``wind`` or ``attitude``.
         t
             Time stamp [s]; it was valid at t minus the configured delay.
         values
             By column name as in the flight folder, or in order: gnss ``lat, lon, alt[, vel_n, vel_e, vel_d]`` (deg, m, m/s),
             barometer ``pressure`` [Pa], magnetometer ``mag_x, mag_y, mag_z`` [uT], to which a calibration (``magnetometer.*``) is applied,
-            power ``current`` [A], airdata ``airspeed`` [m/s], ``aoa``, ``sideslip`` [rad], wind ``wind_n, wind_e, wind_d, sd`` [m/s].
+            power ``current`` [A], rotors the speeds of all [rad/s], airdata ``airspeed[, aoa, sideslip]``, wind
+            ``wind_n, wind_e[, wind_d, sd]`` [m/s, blowing to], attitude ``q_w, q_x, q_y, q_z``.
         variances
             Of the values in order, for gnss (lat, lon and alt in m^2); NaN, not positive or absent: as configured.
 
@@ -340,14 +357,8 @@ class Estimator:
             return (
                 self._queue(POWER, t, (current, math.nan, math.nan), _NAN) if math.isfinite(current) else self._refuse(sensor, "not finite")
             )
-        if sensor == "airdata":
-            return self._offer_airdata(t, values)
-        if sensor == "wind":
-            w = _in_order(sensor, values, 2)
-            if not math.isfinite(w[0] + w[1]):
-                return self._refuse(sensor, "not finite")
-            sd = w[3] if w[3] > 0.0 else self.config.number("wind.sd")
-            return self._queue(WIND, t, (w[0], w[1], w[2]), (sd * sd, math.nan, math.nan))
+        if sensor in ("rotors", "airdata", "wind", "attitude"):
+            return self._offer_of_the_air(sensor, t, values)
         m = _in_order(sensor, values, 3)
         if not math.isfinite(m[0] + m[1] + m[2]):
             return self._refuse(sensor, "not finite")
@@ -395,14 +406,36 @@ class Estimator:
             return self._refuse("barometer", "not finite")
         return self._queue(BAROMETER, t, (h, math.nan, math.nan), _NAN)
 
-    def _offer_airdata(self, t: float, values: Sequence[float] | Mapping[str, float]) -> bool:
-        data = _in_order("airdata", values, 3)
-        if not math.isfinite(sum(data)):
-            return self._refuse("airdata", "no vane" if math.isfinite(data[0]) else "not finite")
-        if data[0] < ENOUGH * self.config.number("noise.airspeed"):
+    def _offer_of_the_air(self, sensor: str, t: float, values: Sequence[float] | Mapping[str, float]) -> bool:
+        if sensor == "rotors":
+            speeds = values.values() if isinstance(values, Mapping) else _flat(values, "values of rotors")
+            total = sum(abs(_number(x, "a rotor's speed", "Estimator.offer")) for x in speeds)
+            return self._queue(ROTORS, t, (total, math.nan, math.nan), _NAN) if math.isfinite(total) else self._refuse(sensor, "not finite")
+        v = _in_order(sensor, values, {"airdata": 1, "wind": 2, "attitude": 4}[sensor])
+        if sensor == "airdata" and self._kernels is quaternion_step:
+            return self._offer_air_vector(t, v)
+        if sensor == "airdata":
+            taken = math.isfinite(v[0]) and self._queue(AIRSPEED, t, (v[0], math.nan, math.nan), _NAN)
+            vanes = math.isfinite(v[1] + v[2]) and self._queue(VANES, t, (v[1], v[2], math.nan), _NAN)
+            return taken or vanes or (not math.isfinite(v[0]) and self._refuse(sensor, "not finite"))
+        if sensor == "wind":
+            if not math.isfinite(v[0] + v[1]):
+                return self._refuse(sensor, "not finite")
+            r = v[3] * v[3] if v[3] > 0.0 else math.nan
+            return self._queue(WIND, t, (v[0], v[1], v[2]), (r, r, r))
+        if not math.isfinite(sum(v)) or not 0.9 < math.hypot(*v) < 1.1:
+            return self._refuse(sensor, "not a unit quaternion")
+        x, y, z = rotation_vector(np.array([v]))[0].tolist()
+        return self._queue(ATTITUDE, t, (x, y, z), _NAN)
+
+    def _offer_air_vector(self, t: float, v: tuple[float, ...]) -> bool:
+        """Air data of the published filter, which hears them as a vector, see `haltere.estimators.air`."""
+        if not math.isfinite(sum(v)):
+            return self._refuse("airdata", "no vane" if math.isfinite(v[0]) else "not finite")
+        if v[0] < ENOUGH * self.config.number("noise.airspeed"):
             return self._refuse("airdata", "airspeed below three times its noise")
-        v, r = (a[0].tolist() for a in vanes(np.array([data]), self.config))
-        return self._queue(AIR_VANES, t, (v[0], v[1], v[2]), (r[0], r[1], r[2]))
+        z, r = (a[0].tolist() for a in vanes(np.array([v]), self.config))
+        return self._queue(VANES, t, (z[0], z[1], z[2]), (r[0], r[1], r[2]))
 
     def _queue(self, kind: int, t: float, z: tuple[float, float, float], r: tuple[float, float, float]) -> bool:
         return bool(self._kernels.offer(self._S, self._prm, kind, t, z, r) in (1, -1))
@@ -424,11 +457,7 @@ class Estimator:
             ("barometer", (BAROMETER,)),
             ("magnetometer", (MAGNETOMETER,)),
             ("power", (POWER,)),
-            ("airdata", (AIR_VANES,)),
-            ("wind", (WIND,)),
         ):
-            if max(kinds) >= self._S["aid"].shape[1]:
-                continue
             for field, reason in (("n_late", "later than the fusion horizon"), ("n_overflow", "queue full before the first IMU sample")):
                 if n := sum(int(self._S["aid"][field][0, k]) for k in kinds):
                     out.setdefault(sensor, {})[reason] = n

@@ -12,10 +12,21 @@ import numpy as np
 from numpy.typing import NDArray
 
 from haltere._jit import as_records, entry
-from haltere.aids.record import AIR_VANES, BAROMETER, GNSS_POSITION, GNSS_VELOCITY, MAGNETOMETER, POWER, ROTORS, WIND
+from haltere.aids.record import (
+    AIRSPEED,
+    ATTITUDE,
+    BAROMETER,
+    GNSS_POSITION,
+    GNSS_VELOCITY,
+    MAGNETOMETER,
+    POWER,
+    ROTORS,
+    VANES,
+    WIND,
+)
 from haltere.core.earth import pressure_altitude
 from haltere.errors import UsageError
-from haltere.estimators.air import air_from_vanes, given_wind, rotor_lift, steady_wind
+from haltere.estimators.air import air_from_vanes, given_wind, steady_wind
 from haltere.flight import config as configuration
 from haltere.flight.config import KEYS, Config
 from haltere.flight.corrections import mounted
@@ -24,7 +35,7 @@ from haltere.flight.field import decimal_year, earth_field
 from haltere.flight.log import FlightLog, Stream
 from haltere.strapdown.layout import PARAMETERS
 
-__all__ = ["Measurements", "configure", "horizon", "imu_arrays", "measurements", "parameters", "request"]
+__all__ = ["Measurements", "configure", "horizon", "imu_arrays", "measurements", "parameters", "request", "rotation_vector"]
 
 FloatArray = NDArray[np.float64]
 
@@ -107,9 +118,31 @@ def configure(
                 values[f"field.{key}"] = value
     if math.isnan(float(values["field.declination"])):
         values["field.declination"] = 0.0
+    return Config(estimator, preset, values | _decided(checked, values))
+
+
+def _decided(checked: Checked, values: Mapping[str, Any]) -> dict[str, Any]:
+    """What ``auto`` comes to with the streams of a flight."""
+    rotors, airdata = checked.streams.get("rotors"), checked.streams.get("airdata")
+    fly = rotors is not None and rotor_count(rotors) >= 3
+    tube = airdata is not None and bool(np.isfinite(airdata.get("airspeed")).any())
+    vanes = airdata is not None and bool(np.isfinite(airdata.get("aoa") + airdata.get("sideslip")).any())
     if values["wind_attitude.filter"] == "quaternion":
-        values["wind_attitude.air"] = air_provider(checked, asked)
-    return Config(estimator, preset, values)
+        if values["wind_attitude.air"] != "auto":
+            return {}
+        # airspeed without vanes is taken too, where there is nothing else: it says what it lacks
+        return {"wind_attitude.air": "vanes" if tube and vanes else "drag" if fly else "vanes" if tube else "off"}
+    found = {"aid.drag": fly, "aid.airdata": tube, "aid.vanes": vanes, "aid.no_sideslip": tube and not (vanes or fly)}
+    return {key: "on" if there else "off" for key, there in found.items() if values[key] == "auto"}
+
+
+def rotor_count(rotors: Stream) -> int:
+    """Rotors of a stream that ever turned, by their speeds, or where there are none by their commands."""
+    for stem in ("speed_", "command_"):
+        columns = [rotors[c] for c in rotors.names if c.startswith(stem)]
+        if columns:
+            return sum(bool(np.any(np.nan_to_num(v) != 0.0)) for v in columns)
+    return 0
 
 
 def _spread(keys: Mapping[str, Any]) -> dict[str, Any]:
@@ -162,9 +195,78 @@ def _variances(stream: Stream, *names: str) -> FloatArray:
     return np.where(sd > 0.0, sd * sd, np.nan)
 
 
+def rotation_vector(q: FloatArray) -> FloatArray:
+    """Rotation vectors (n, 3) [rad] of quaternions (n, 4), scalar first, of any length."""
+    q = q / np.linalg.norm(q, axis=1)[:, None] * np.where(q[:, :1] < 0.0, -1.0, 1.0)
+    size = np.linalg.norm(q[:, 1:], axis=1)
+    angle = 2.0 * np.arctan2(size, q[:, 0])
+    return np.asarray(q[:, 1:] * np.where(size > 1e-12, angle / np.maximum(size, 1e-12), 2.0)[:, None])
+
+
+Part = tuple[int, FloatArray, FloatArray, FloatArray]
+
+
+def _of_the_air(checked: Checked, config: Config) -> list[Part]:
+    """Rotor speeds, air data, and what is told from outside."""
+    parts: list[Part] = []
+
+    def add(code: int, t: FloatArray, z: FloatArray, r: FloatArray | None = None) -> None:
+        there = np.isfinite(z[:, 0])
+        wide = np.full((int(there.sum()), 3), np.nan)
+        wide[:, : z.shape[1]] = z[there]
+        parts.append((code, t[there], wide, np.full_like(wide, np.nan) if r is None else r[there]))
+
+    rotors, airdata = checked.streams.get("rotors"), checked.streams.get("airdata")
+    if rotors is not None and config["aid.drag"] == "on":
+        speeds = [rotors[c] for c in rotors.names if c.startswith("speed_")]
+        if speeds:
+            add(ROTORS, rotors.t, np.sum(np.abs(speeds), axis=0)[:, None])
+    if airdata is not None and config["aid.airdata"] == "on":
+        add(AIRSPEED, airdata.t, airdata.get("airspeed")[:, None])
+        if config["aid.vanes"] == "on":
+            vanes = np.column_stack([airdata.get("aoa"), airdata.get("sideslip")])
+            add(VANES, airdata.t, np.where(np.isfinite(vanes).all(axis=1)[:, None], vanes, np.nan))
+    wind, attitude = checked.streams.get("wind"), checked.streams.get("attitude")
+    if wind is not None and config["aid.wind"] == "on" and "on" in (config["aid.drag"], config["aid.airdata"]):
+        add(WIND, wind.t, wind.vector("wind", "ned"), _variances(wind, "sd", "sd", "sd"))
+    if attitude is not None and config["aid.attitude"] == "on":
+        add(ATTITUDE, attitude.t, rotation_vector(attitude.vector("q", "wxyz")))
+    return parts
+
+
+def _wind_triangle(checked: Checked, config: Config) -> list[Part]:
+    """What the published filter of `wind-attitude` hears of the air: air velocity, wind, rotor speeds; what is missing is told."""
+    parts: list[Part] = []
+    told, left_out = checked.warnings, checked.discarded
+    airdata, rotors = checked.streams.get("airdata"), checked.streams.get("rotors")
+    if airdata is not None and config["aid.airdata"] == "on" and config["wind_attitude.air"] == "vanes":
+        air = air_from_vanes(airdata, config)
+        parts.append((VANES, air.t, air.v_b, air.r))
+        told += air.warnings
+        for reason, n in air.left_out.items():
+            left_out.setdefault("airdata", {})[reason] = n
+    wind = given_wind(checked.streams.get("wind"), config) if config["aid.wind"] == "on" else None
+    if wind is not None:
+        parts.append((WIND, wind.t, wind.wind_n, np.repeat(wind.r[:, None], 3, axis=1)))
+    if config["wind_attitude.air"] == "drag" and rotors is not None:
+        speeds = [rotors[c] for c in rotors.names if c.startswith("speed_")]
+        if speeds:
+            total = np.asarray(np.sum(np.abs(speeds), axis=0))
+            there = np.asarray(np.isfinite(total))
+            nan = np.full((int(there.sum()), 3), np.nan)
+            parts.append((ROTORS, rotors.t[there], np.column_stack([total[there], nan[:, :2]]), nan))
+    if config["wind_attitude.air"] != "off":
+        lacks = [] if checked.streams.get("gnss") is not None and config["aid.gnss"] == "on" else ["velocity from GNSS"]
+        if wind is None and steady_wind(config.values) is None:
+            lacks.append("wind (keys wind.n and wind.e or wind.speed and wind.from, or a stream wind)")
+        if lacks:
+            told.append(f"wind triangle: no {' and no '.join(lacks)}; attitude is that of gravity and field alone")
+    return parts
+
+
 def measurements(flight: FlightLog, checked: Checked, config: Config) -> Measurements:
     """Measurements that the configuration lets in, in the order of their stamps (ties: the order of the sensor codes)."""
-    parts: list[tuple[int, FloatArray, FloatArray, FloatArray]] = []
+    parts: list[Part] = []
     gnss = checked.streams.get("gnss")
     if gnss is not None and config["aid.gnss"] == "on":
         v, r_v = gnss.vector("vel", "ned"), _variances(gnss, "s_acc", "s_acc", "s_acc")
@@ -187,8 +289,7 @@ def measurements(flight: FlightLog, checked: Checked, config: Config) -> Measure
         current = power.get("current")
         value = np.column_stack([current, np.full((len(power), 2), np.nan)])
         parts.append((POWER, power.t, value, np.full_like(value, np.nan)))
-    if config["wind_attitude.filter"] == "quaternion":
-        parts += _wind_triangle(flight, checked, config)
+    parts += (_wind_triangle if config["wind_attitude.filter"] == "quaternion" else _of_the_air)(checked, config)
     if not parts:
         return Measurements(np.empty(0, np.int64), np.empty(0), np.empty((0, 3)), np.empty((0, 3)))
     kind = np.concatenate([np.full(len(t), k, np.int64) for k, t, _, _ in parts])
@@ -196,51 +297,3 @@ def measurements(flight: FlightLog, checked: Checked, config: Config) -> Measure
     order = np.argsort(t, kind="stable")
     z, r = np.concatenate([p[2] for p in parts]), np.concatenate([p[3] for p in parts])
     return Measurements(kind[order], t[order], np.ascontiguousarray(z[order]), np.ascontiguousarray(r[order]))
-
-
-def _wind_triangle(flight: FlightLog, checked: Checked, config: Config) -> list[tuple[int, FloatArray, FloatArray, FloatArray]]:
-    """What the published filter of `wind-attitude` hears beside the others: air velocity, wind, rotor speeds; what is missing is told."""
-    parts: list[tuple[int, FloatArray, FloatArray, FloatArray]] = []
-    told, left_out = checked.warnings, checked.discarded
-    airdata = checked.streams.get("airdata")
-    if airdata is not None and config["aid.airdata"] == "on" and config["wind_attitude.air"] == "vanes":
-        air = air_from_vanes(airdata, config)
-        parts.append((AIR_VANES, air.t, air.v_b, air.r))
-        told += air.warnings
-        for reason, n in air.left_out.items():
-            left_out.setdefault("airdata", {})[reason] = n
-    wind = given_wind(checked.streams.get("wind"), config)
-    if wind is not None:
-        parts.append((WIND, wind.t, wind.wind_n, np.column_stack([wind.r, np.full((len(wind.t), 2), np.nan)])))
-    if config["wind_attitude.air"] == "drag":
-        lift = rotor_lift(flight, config)
-        if lift is not None:
-            nan = np.full((len(lift[0]), 3), np.nan)
-            parts.append((ROTORS, lift[0], np.column_stack([lift[1], nan[:, :2]]), nan))
-    if config["wind_attitude.air"] != "off":
-        lacks = [] if checked.streams.get("gnss") is not None and config["aid.gnss"] == "on" else ["velocity from GNSS"]
-        if wind is None and steady_wind(config.values) is None:
-            lacks.append("wind (keys wind.n and wind.e or wind.speed and wind.from, or a stream wind)")
-        if lacks:
-            told.append(f"wind triangle: no {' and no '.join(lacks)}; attitude is that of gravity and field alone")
-    return parts
-
-
-def air_provider(checked: Checked, config: Config) -> str:
-    """Where the published filter takes the velocity through the air from: ``wind_attitude.air`` with ``auto`` resolved.
-
-    Raises
-    ------
-    UsageError
-        Drag is asked for and its coefficient is not known.
-    """
-    word = str(config["wind_attitude.air"])
-    airdata, drag = checked.streams.get("airdata"), not math.isnan(config.number("drag.mu"))
-    if word == "auto":
-        whole = airdata is not None and all(np.isfinite(airdata.get(c)).any() for c in ("airspeed", "aoa", "sideslip"))
-        word = "vanes" if whole else "drag" if drag else "off"
-        if word == "off" and airdata is not None:
-            word = "vanes"  # which says what it lacks
-    if word == "drag" and not drag:
-        raise UsageError("drag.mu, the rotor drag over mass", "none", "wind_attitude.air=drag", "set drag.mu [1/s], 0.2 to 0.6")
-    return word

@@ -9,24 +9,25 @@ import math
 from typing import Any
 
 from haltere._jit import jit
-from haltere.aids import air_vector, vectors
+from haltere.aids import air_vector, drag, vectors
 from haltere.aids.fusing import judge
 from haltere.aids.gnss import velocity_variance
 from haltere.aids.record import (
     ACCELEROMETER,
-    AIR_BODY,
-    AIR_VANES,
     C_AIR,
     C_DOWN,
     C_UNIT_FIELD,
+    DRAG,
     GNSS_VELOCITY,
     MAGNETOMETER,
     R_ACCELERATION,
     R_NONE,
     ROTORS,
+    VANES,
     WIND,
     record,
 )
+from haltere.core.earth import STANDARD_DENSITY, density
 from haltere.core.rotation import Mat, Quat, Vec, mat_vec, norm, quat_unit, scale
 from haltere.filter.gates import ABSENT
 from haltere.filter.joint import Rows, innovation_covariance, inverse, update
@@ -39,10 +40,10 @@ __all__ = ["fuse", "fuse_air", "fuse_all", "gravity_shown", "hear"]
 AGE_MAX, AGE_ACCELERATION = 0.5, 3.0
 #: Time constant [s] of the acceleration that GNSS velocity shows.
 ACCELERATION_TIME = 0.5
-#: The drag is read off specific force over so long [s]; rotor speeds hold for so long.
-BLOCK, ROTORS_AGE = 0.1, 0.5
+#: The drag is read off specific force over so long [s].
+BLOCK = 0.1
 #: Provider of air velocity: code of ``drag`` in ``wind_attitude.air``.
-DRAG = 2.0
+BY_DRAG = 2.0
 NOTHING = (0.0, 0.0, 0.0, 0.0)
 
 
@@ -62,9 +63,9 @@ def hear(s: Any, prm: Any, kind: int, m: Any) -> None:
     elif kind == WIND:
         for i in range(3):
             s.wind_v[i] = m.z[i] if m.z[i] == m.z[i] else 0.0
-        s.wind_r, s.has_wind = m.r[0], 1
+        s.wind_r, s.has_wind = m.r[0] if m.r[0] > 0.0 else prm.noise_given_wind * prm.noise_given_wind, 1
     elif kind == ROTORS:
-        s.lift, s.t_rotors = m.z[0], m.t
+        drag.hear(s, m.t, m.z[0])
 
 
 @jit
@@ -137,14 +138,14 @@ def fuse_air(s: Any, prm: Any, aids: Any, t: float, kind: int, z: Vec, r: Vec) -
     old = (s.t - s.t_gnss) * AGE_ACCELERATION
     more = s.wind_r + old * old
     T = vectors.turned_covariance(quat_unit(x), (s.gnss_r[0] + more, s.gnss_r[1] + more, s.gnss_r[2] + more))
-    B = air_vector.air_covariance(z, r) if kind == AIR_VANES else ((r[0], 0.0, 0.0), (0.0, r[1], 0.0), (0.0, 0.0, r[2]))
+    B = air_vector.air_covariance(z, r) if kind == VANES else ((r[0], 0.0, 0.0), (0.0, r[1], 0.0), (0.0, 0.0, r[2]))
     R = (
         (T[0][0] + B[0][0], T[0][1] + B[0][1], T[0][2] + B[0][2]),
         (T[1][0] + B[1][0], T[1][1] + B[1][1], T[1][2] + B[1][2]),
         (T[2][0] + B[2][0], T[2][1] + B[2][1], T[2][2] + B[2][2]),
     )
     H = vectors.printed_wind_rows(x) if prm.wind_attitude_rows > 0.0 else vectors.seen_rows(x, a)
-    fuse(s, prm, aids, t, kind, C_AIR, z, vectors.seen(x, a), H, R, prm.gate_airdata, R_NONE)
+    fuse(s, prm, aids, t, kind, C_AIR, z, vectors.seen(x, a), H, R, prm.gate_air, R_NONE)
 
 
 @jit
@@ -157,16 +158,22 @@ def fuse_drag(s: Any, prm: Any, aids: Any, f: Vec) -> None:
     if span < BLOCK - 1e-6:
         return
     k = 1.0 / s.n_block
-    mean = (k * s.f_block[0] - prm.drag_offset_x, k * s.f_block[1] - prm.drag_offset_y, k * s.f_block[2])
+    mean = (k * s.f_block[0], k * s.f_block[1], k * s.f_block[2])
     s.n_block, s.t_block = 0.0, s.t
     for i in range(3):
         s.f_block[i] = 0.0
-    lift = s.lift if s.t - s.t_rotors < ROTORS_AGE else math.sqrt(max(-mean[2], 0.0) / s.gravity)
-    if lift < 0.3:  # rotors that hardly turn have no drag to speak of
+    thrust = -mean[2]
+    if thrust < drag.LEAST_THRUST * s.gravity:
         return
-    sd = math.sqrt(prm.noise_accel * prm.noise_accel / span + prm.init_accel_bias * prm.init_accel_bias)
-    v, r = air_vector.from_drag(mean, prm.drag_mu, prm.drag_c, lift, prm.drag_density, sd, prm.drag_mu_sd)
-    fuse_air(s, prm, aids, s.t, AIR_BODY, v, r)
+    ratio = 1.0
+    if prm.air_density > 0.0:
+        ratio = prm.air_density / STANDARD_DENSITY
+    elif s.has_origin == 1:
+        ratio = density(s.origin[2]) / STANDARD_DENSITY
+    mu, c = prm.drag_mu * drag.spin(s, thrust, ratio), prm.drag_c * ratio
+    sd = math.sqrt(prm.noise_drag * prm.noise_drag + prm.init_accel_bias * prm.init_accel_bias + prm.drag_offset_sd * prm.drag_offset_sd)
+    v, r = air_vector.from_drag(mean, mu, c, sd, prm.drag_mu_sd)
+    fuse_air(s, prm, aids, s.t, DRAG, v, r)
 
 
 @jit
@@ -202,11 +209,10 @@ def fuse_all(s: Any, prm: Any, aids: Any, f: Vec, dt: float) -> None:
                 diagonal(r), prm.gate_magnetometer, R_NONE,
             )  # fmt: skip
         k = pop_due(s, MAGNETOMETER, s.t)
-    for kind in (AIR_VANES, AIR_BODY):
-        k = pop_due(s, kind, s.t)
-        while k >= 0:
-            m = s.ring[kind, k]
-            fuse_air(s, prm, aids, m.t, kind, (m.z[0], m.z[1], m.z[2]), (m.r[0], m.r[1], m.r[2]))
-            k = pop_due(s, kind, s.t)
-    if prm.wind_attitude_air == DRAG:
+    k = pop_due(s, VANES, s.t)
+    while k >= 0:
+        m = s.ring[VANES, k]
+        fuse_air(s, prm, aids, m.t, VANES, (m.z[0], m.z[1], m.z[2]), (m.r[0], m.r[1], m.r[2]))
+        k = pop_due(s, VANES, s.t)
+    if prm.wind_attitude_air == BY_DRAG:
         fuse_drag(s, prm, aids, f)

@@ -11,8 +11,6 @@ from typing import Any
 
 from haltere._jit import entry, jit
 from haltere.aids.record import (
-    AIR_BODY,
-    AIR_VANES,
     E_ALIGNED,
     E_DIVERGED,
     E_GAP,
@@ -21,6 +19,7 @@ from haltere.aids.record import (
     MAGNETOMETER,
     NO_SENSOR,
     ROTORS,
+    VANES,
     WIND,
     event,
 )
@@ -45,7 +44,7 @@ def stage_of(S: Any) -> None:
 
 
 @entry
-def row_width(n_baro: int = 0, n_mag: int = 0) -> int:
+def row_width(n: int) -> int:
     """Columns of the output rows: those of `haltere.estimators.step.row_width`, of which only t, q and P_θθ are filled."""
     return 35
 
@@ -124,7 +123,7 @@ def sound(s: Any) -> bool:
 def begin(s: Any, t: float) -> None:
     """Forget what was gathered; the filter aligns anew."""
     s.t, s.phase, s.t_first, s.n_m, s.n_f, s.path = t, 1, t, 0.0, 0.0, 0.0
-    s.t_gnss, s.t_rotors, s.n_block, s.t_block = -1e9, -1e9, 0.0, t
+    s.t_gnss, s.air.t_rotors, s.air.n_ratio, s.n_block, s.t_block = -1e9, -1e9, 0, 0.0, t
     s.turned[0], s.turned[1], s.turned[2], s.turned[3] = 1.0, 0.0, 0.0, 0.0
     for i in range(3):
         s.f_sum[i], s.m_sum[i], s.f_block[i], s.gnss_a[i] = 0.0, 0.0, 0.0, 0.0
@@ -153,7 +152,7 @@ def gather(s: Any, prm: Any, w0: Vec, w1: Vec, f: Vec, dt: float) -> None:
     for i in range(3):
         s.f_sum[i] += part[i]
     s.n_f += 1.0
-    for kind in range(len(s.aid)):
+    for kind in range(len(s.ring_n)):
         k = pop_due(s, kind, s.t)
         while k >= 0:
             m = s.ring[kind, k]
@@ -268,9 +267,13 @@ def offer(S: Any, PRM: Any, kind: int, t: float, z: Vec, r: Vec) -> int:
         delay = prm.delay_gnss_velocity
     elif kind == MAGNETOMETER and prm.aid_magnetometer > 0.0:
         delay = prm.delay_magnetometer
-    elif kind in (AIR_VANES, AIR_BODY) and prm.aid_airdata > 0.0:
+    elif kind == VANES and prm.aid_airdata > 0.0:
         delay = prm.delay_airdata
-    elif kind != WIND and kind != ROTORS:
+    elif kind == WIND and prm.aid_wind > 0.0:
+        delay = prm.delay_wind
+    elif kind == ROTORS:
+        delay = prm.delay_rotors
+    else:
         return 2
     return push(s, kind, t - delay, z, r)
 

@@ -111,6 +111,36 @@ KEYS: dict[str, Key] = {
         "m/s",
         "Fake velocity of ahrs, 1 sigma at 5 Hz: worth 2 m/s that last a second. Lower trusts gravity more, accelerations less.",
     ),
+    "noise.wind": _positive(
+        0.3, "m/s/sqrt(s)", "Walk of the horizontal wind that air data show. Higher follows gusts sooner, and is less sure."
+    ),
+    "noise.wind_mean": _positive(0.05, "m/s/sqrt(s)", "Walk of the mean wind of a multirotor, which gusts return to."),
+    "wind.n": Key(math.nan, "m/s", "Wind taken for true, where it blows to, north. Default: not given.", low=-100.0, high=100.0),
+    "wind.e": Key(math.nan, "m/s", "The same, east.", low=-100.0, high=100.0),
+    "wind.d": Key(0.0, "m/s", "The same, down.", low=-50.0, high=50.0),
+    "wind.speed": Key(math.nan, "m/s", "Instead of wind.n and wind.e, as a station gives it: its speed,", low=0.0, high=100.0),
+    "wind.from": Key(math.nan, "rad", "and where it comes from, clockwise from true north.", low=-6.2832, high=6.2832),
+    "wind.sd": _positive(1.0, "m/s", "1 sigma of each of its components, gusts included."),
+    "wind.gust": _positive(0.3, "m/s", "Gusts of a multirotor's wind, 1 sigma in calm air."),
+    "wind.turbulence": Key(0.2, "1", "Gusts more in proportion to the mean wind.", low=0.0, high=2.0),
+    "wind.gust_time": _positive(3.0, "s", "How long a gust lasts."),
+    "noise.wind_d": _positive(0.1, "m/s/sqrt(s)", "Walk of the vertical wind."),
+    "noise.air_walk": _positive(
+        2e-3, "1/sqrt(s)", "Walk of what air data depend on: relative for drag and airspeed scale, in m/s^2 and rad for offsets."
+    ),
+    "noise.airspeed": _positive(1.0, "m/s", "Airspeed, 1 sigma, alike in all samples of noise.airdata_time."),
+    "noise.aoa": _positive(2.0 * DEG, "rad", "Vane of the angle of attack, 1 sigma, likewise."),
+    "noise.sideslip": _positive(2.0 * DEG, "rad", "Vane of the sideslip, 1 sigma, likewise."),
+    "noise.airdata_time": Key(0.5, "s", "How long errors of air data last (gusts shorter than that, the tube's lag).", low=0.0),
+    "noise.no_sideslip": _positive(6.0 * DEG, "rad", "Sideslip of an aeroplane without vanes, 1 sigma, likewise."),
+    "noise.drag": _positive(0.2, "m/s^2", "What the drag model misses, 1 sigma, alike in all samples of noise.drag_time."),
+    "noise.drag_time": Key(0.2, "s", "That correlation time.", low=0.0),
+    "noise.given_wind": _positive(1.0, "m/s", "Wind told from outside, 1 sigma, where no sd is told with it."),
+    "noise.attitude": _positive(1.0 * DEG, "rad", "Roll and pitch told from outside, 1 sigma."),
+    "noise.attitude_yaw": _positive(2.0 * DEG, "rad", "Yaw told from outside, 1 sigma."),
+    "noise.attitude_time": Key(1.0, "s", "How long the errors of a told attitude last.", low=0.0),
+    "gate.air": _positive(5.0, "sigma", "Innovation gate of airspeed, vanes, drag and told wind."),
+    "gate.attitude": _positive(5.0, "sigma", "Innovation gate of a told attitude."),
     "gate.gnss": _positive(5.0, "sigma", "Innovation gate of GNSS position and velocity, joint over the components."),
     "gate.barometer": _positive(5.0, "sigma", "Innovation gate of the barometer."),
     "gate.magnetometer": _positive(6.0, "sigma", "Innovation gate of the magnetometer."),
@@ -120,6 +150,10 @@ KEYS: dict[str, Key] = {
     "delay.gnss_position": _delay("The same for position."),
     "delay.barometer": _delay("The same for the barometer."),
     "delay.magnetometer": _delay("The same for the magnetometer."),
+    "delay.rotors": _delay("The same for rotor speeds."),
+    "delay.airdata": _delay("The same for airspeed and vanes."),
+    "delay.wind": _delay("The same for a told wind."),
+    "delay.attitude": _delay("The same for a told attitude."),
     "aid.gnss": _switch("on", "Use GNSS position and velocity."),
     "aid.barometer": _switch("on", "Use the barometer."),
     "aid.magnetometer": _switch(
@@ -133,25 +167,40 @@ KEYS: dict[str, Key] = {
     "aid.fake_position": _switch("on", "Fake position while nothing else holds it."),
     "aid.yaw_bank": _switch("on", "Set yaw from GNSS velocity where it is unknown, or contradicted by it."),
     "aid.fake_velocity": _switch("off", "Fake zero velocity, always on in ahrs."),
-    "aid.airdata": _switch("on", "Use airspeed and vanes."),
-    "noise.airspeed": _positive(0.5, "m/s", "Airspeed, 1 sigma."),
-    "noise.aoa": _positive(2.0 * DEG, "rad", "Angle of attack, 1 sigma in a steady fast flow."),
-    "noise.sideslip": _positive(2.0 * DEG, "rad", "Sideslip angle, 1 sigma in a steady fast flow."),
-    "gate.airdata": _positive(5.0, "sigma", "Innovation gate of air data."),
-    "delay.airdata": _delay("The same for air data."),
-    "wind.n": Key(math.nan, "m/s", "Wind as given, where it blows to, north. Default: not given.", low=-100.0, high=100.0),
-    "wind.e": Key(math.nan, "m/s", "The same, east.", low=-100.0, high=100.0),
-    "wind.d": Key(0.0, "m/s", "The same, down.", low=-50.0, high=50.0),
-    "wind.speed": Key(math.nan, "m/s", "Wind as a station gives it, instead: its speed,", low=0.0, high=100.0),
-    "wind.from": Key(math.nan, "rad", "and where it comes from, clockwise from true north.", low=-6.2832, high=6.2832),
-    "wind.sd": _positive(1.0, "m/s", "1 sigma of each component of a given wind, gusts included."),
-    "drag.mu": _positive(math.nan, "1/s", "Rotor drag in hover at sea level over mass. Default: not known."),
-    "drag.c": Key(0.0, "1/m", "Body drag over mass.", low=0.0, high=10.0),
-    "drag.mu_sd": _positive(0.15, "1", "1 sigma of ln mu."),
-    "drag.offset_x": Key(0.0, "m/s^2", "Specific force along x without air flow.", low=-10.0, high=10.0),
-    "drag.offset_y": Key(0.0, "m/s^2", "The same along y.", low=-10.0, high=10.0),
-    "drag.density": _positive(1.0, "1", "Density of the air over that at sea level."),
-    "drag.hover_speed": _positive(math.nan, "rad/s", "Mean rotor speed in hover. Default: not known, thrust is taken from specific force."),
+    "aid.drag": _switch(
+        "auto",
+        "Estimate the horizontal wind of a multirotor from its drag, and the drag with it; auto: where at least three rotors turn.",
+        ("off", "on", "auto"),
+    ),
+    "aid.airdata": _switch(
+        "auto",
+        "Estimate the wind from airspeed and vanes, and their scale and offsets with it; auto: where the log has them.",
+        ("off", "on", "auto"),
+    ),
+    "aid.vanes": _switch(
+        "auto",
+        "Use vanes of angle of attack and sideslip, and estimate the vertical wind too; auto: where the log has both.",
+        ("off", "on", "auto"),
+    ),
+    "aid.no_sideslip": _switch(
+        "auto", "Take an aeroplane to fly straight through the air; auto: with airspeed, without vanes and rotors.", ("off", "on", "auto")
+    ),
+    "aid.wind": _switch("on", "Use the stream wind, told from outside, where wind is estimated."),
+    "aid.attitude": _switch("on", "Use the stream attitude, told from outside."),
+    "air.moves": _switch(
+        "wind",
+        "What measurements of the air may move while GNSS is heard: only the wind and their own coefficients, or the whole state.",
+        ("wind", "all"),
+    ),
+    "air.density": _positive(math.nan, "kg/m^3", "Air density at the origin. Default: standard atmosphere at its altitude."),
+    "air.airspeed_min": _positive(4.0, "m/s", "Airspeeds below this say nothing."),
+    "drag.mu": _positive(0.3, "1/s", "Rotor drag over mass and speed at hover, standard atmosphere at sea level: as begun with."),
+    "drag.mu_sd": _positive(0.35, "1", "Its relative 1 sigma, log-normal. `haltere identify --drag` finds both."),
+    "drag.c": _positive(0.008, "1/m", "Quadratic drag over mass, standard atmosphere at sea level: as begun with."),
+    "drag.c_sd": _positive(0.7, "1", "Its relative 1 sigma, log-normal."),
+    "drag.offset_sd": _positive(0.1, "m/s^2", "1 sigma of what the thrust's axis is askew to the accelerometer's: 0.1 is 0.6 deg."),
+    "timeout.air": _positive(10.0, "s", "The same for measurements of the air."),
+    "timeout.attitude": _positive(10.0, "s", "The same for a told attitude."),
     "timeout.gnss": _positive(7.0, "s", "After this long without a fix that passes, GNSS is let in again by force, at the gate's edge."),
     "timeout.barometer": _positive(7.0, "s", "The same for the barometer."),
     "timeout.magnetometer": _positive(10.0, "s", "The same for the magnetometer."),
@@ -197,6 +246,10 @@ KEYS: dict[str, Key] = {
     "init.velocity": _positive(0.3, "m/s", "Least 1 sigma of velocity."),
     "init.baro_bias": _positive(3.0, "m", "1 sigma of the barometer offset."),
     "init.mag_offset": _positive(5.0, "uT", "1 sigma of the magnetometer's offset, where it is estimated."),
+    "init.wind": _positive(5.0, "m/s", "1 sigma of each component of the horizontal wind, which begins at none."),
+    "init.wind_d": _positive(1.0, "m/s", "1 sigma of the vertical wind."),
+    "init.airspeed_scale": _positive(0.1, "1", "Relative 1 sigma of the airspeed's scale."),
+    "init.vane": _positive(3.0 * DEG, "rad", "1 sigma of a vane's offset."),
     "rest.gyro": _positive(0.02, "rad/s", "At rest the rate's standard deviation over a second is below this."),
     "rest.accel": _positive(0.3, "m/s^2", "At rest the standard deviation of |f| over a second is below this."),
     "rest.gravity": _positive(0.5, "m/s^2", "At rest mean |f| differs from gravity by less than this."),
@@ -256,13 +309,12 @@ KEYS: dict[str, Key] = {
     ),
     "wind_attitude.accel": _switch("on", "Take specific force for gravity."),
     "wind_attitude.force": _positive(1.0, "m/s^2", "Only where its size differs from gravity by less than this."),
-    "wind_attitude.acceleration": _positive(
-        1.5, "m/s^2", "And only where GNSS velocity, if there is any, shows an acceleration below this."
-    ),
+    "wind_attitude.acceleration": _positive(1.5, "m/s^2", "And only where GNSS velocity, if any, shows an acceleration below this."),
     "wind_attitude.gate": _positive(1e6, "sigma", "Innovation gate of gravity, joint over the components."),
     "wind_attitude.air": _switch(
         "auto",
-        "Where the velocity through the air is from: vanes (stream airdata), drag (specific force over drag.*), or what there is.",
+        "Where the velocity through the air is from: vanes (stream airdata), drag (specific force over drag.*), or what there is: vanes, "
+        "else drag where at least three rotors turn.",
         ("off", "vanes", "drag", "auto"),
     ),
     "imu.kind": _switch("instant", "An IMU sample is the value at its time, or the mean since the sample before.", ("instant", "mean")),
@@ -309,18 +361,31 @@ GROUPS: dict[str, tuple[str, ...]] = {
 
 _TWO_STAGE = tuple(key for key in KEYS if key.startswith("two_stage."))
 _WIND_ATTITUDE = tuple(key for key in KEYS if key.startswith("wind_attitude."))
+#: A wind taken for true, which only the published filter of wind-attitude needs.
+_GIVEN_WIND = tuple(f"wind.{key}" for key in ("n", "e", "d", "speed", "from", "sd"))
+#: What only an estimator with wind has.
+_AIR = tuple(
+    key for key in KEYS
+    if not key.startswith("delay.") and (key.startswith(("air.", "drag.", "wind.")) or key.partition(".")[2] in (
+        "wind", "wind_d", "wind_mean", "air_walk", "airspeed", "aoa", "sideslip", "airdata_time", "no_sideslip", "drag", "drag_time", "given_wind",
+        "air", "airdata", "vanes", "airspeed_scale", "vane",
+    ))
+)  # fmt: skip
+_NO_AIR: dict[str, Value] = {"aid.drag": "off", "aid.airdata": "off", "aid.vanes": "off", "aid.no_sideslip": "off", "aid.wind": "off"}
 #: What an estimator sets differently from the defaults above.
 _OVERRIDES: dict[str, dict[str, Value]] = {
     "navigator": {},
     "ahrs": {
         "aid.gnss": "off", "aid.barometer": "off", "aid.fake_velocity": "on", "aid.fake_position": "off", "baro.offset": "off",
+        **_NO_AIR,
     },
     "two-stage": {
         "aid.magnetometer": "orthonormal", "aid.barometer": "off", "baro.offset": "off", "aid.fake_velocity": "off",
         "aid.zero_velocity": "off", "aid.zero_rate": "off", "aid.yaw_bank": "off", "aid.compass_watch": "off",
         "aid.motor_field": "off", "two_stage.radial": 0.05, "two_stage.memory": 10.0,
+        **_NO_AIR,
     },
-    "wind-attitude": {},
+    "wind-attitude": {"air.moves": "all"},
 }  # fmt: skip
 _NO_GATE = 1e6
 #: What a preset of an estimator sets differently from its `default`. The source has no innovation tests.
@@ -336,8 +401,8 @@ _PRESET_OVERRIDES["two-stage", "as-printed"] = _PRESET_OVERRIDES["two-stage", "a
     "two_stage.height_sign": "plus",
 }
 _PRESET_OVERRIDES["wind-attitude", "as-corrected"] = {
-    "wind_attitude.filter": "quaternion", "aid.magnetometer": "3-axis", "gate.magnetometer": _NO_GATE, "gate.airdata": _NO_GATE,
-    "noise.field": 0.0,
+    "wind_attitude.filter": "quaternion", "aid.magnetometer": "3-axis", "gate.magnetometer": _NO_GATE, "gate.air": _NO_GATE,
+    "noise.field": 0.0, "aid.airdata": "on",
 }  # fmt: skip
 _PRESET_OVERRIDES["wind-attitude", "as-printed"] = _PRESET_OVERRIDES["wind-attitude", "as-corrected"] | {
     "wind_attitude.residual": "printed", "wind_attitude.rows": "printed", "wind_attitude.normalise": "off",
@@ -345,17 +410,18 @@ _PRESET_OVERRIDES["wind-attitude", "as-printed"] = _PRESET_OVERRIDES["wind-attit
 }  # fmt: skip
 #: Where the keys begin that the published filter of wind-attitude is told; noise and delays a flight may tell of any sensor.
 _QUATERNION = (
-    "noise.", "delay.", "gate.magnetometer", "gate.airdata", "aid.gnss", "aid.magnetometer", "aid.airdata", "timeout.magnetometer",
+    "noise.", "delay.", "gate.magnetometer", "gate.air", "aid.gnss", "aid.magnetometer", "aid.airdata", "aid.wind", "timeout.magnetometer",
     "timeout.imu", "field.", "home.", "init.tilt_", "init.yaw_", "init.accel_bias", "rest.gyro", "rest.gravity", "imu.kind", "unit.",
-    "axes.", "magnetometer.offset_", "magnetometer.matrix_", "magnetometer.load", "wind.", "drag.", "wind_attitude.",
+    "axes.", "magnetometer.offset_", "magnetometer.matrix_", "magnetometer.load", "air.density", "drag.", "wind_attitude.", *_GIVEN_WIND,
 )  # fmt: skip
 #: Keys that an estimator does not have: changing them would change nothing, or make it another one.
 _FIXED: dict[str, tuple[str, ...]] = {
-    "navigator": (*_TWO_STAGE, *_WIND_ATTITUDE),
-    "ahrs": (*_OVERRIDES["ahrs"], *_TWO_STAGE, *_WIND_ATTITUDE),
+    "navigator": (*_TWO_STAGE, *_WIND_ATTITUDE, *_GIVEN_WIND),
+    "ahrs": (*_OVERRIDES["ahrs"], *_TWO_STAGE, *_AIR, *_WIND_ATTITUDE),
     "wind-attitude": (*_TWO_STAGE, "wind_attitude.filter"),
     "two-stage": (
         *_WIND_ATTITUDE,
+        *_AIR,
         "aid.barometer",
         "baro.offset",
         "aid.fake_velocity",
@@ -375,7 +441,7 @@ _FIXED: dict[str, tuple[str, ...]] = {
 }
 #: Further ones by preset.
 _FIXED_PRESET: dict[tuple[str, str], tuple[str, ...]] = {
-    ("wind-attitude", "default"): _WIND_ATTITUDE,
+    ("wind-attitude", "default"): (*_WIND_ATTITUDE, *_GIVEN_WIND),
     **{("wind-attitude", preset): tuple(k for k in KEYS if not k.startswith(_QUATERNION)) for preset in ("as-corrected", "as-printed")},
 }
 #: Words of a switch that an estimator does not have.
@@ -386,7 +452,8 @@ _LACKS: dict[str, dict[str, tuple[str, ...]]] = {
     "wind-attitude": {"aid.magnetometer": ("orthonormal",)},
 }
 _LACKS_PRESET: dict[tuple[str, str], dict[str, tuple[str, ...]]] = {
-    ("wind-attitude", preset): {"aid.magnetometer": ("heading", "orthonormal")} for preset in ("as-corrected", "as-printed")
+    ("wind-attitude", preset): {"aid.magnetometer": ("heading", "orthonormal"), "aid.airdata": ("auto",)}
+    for preset in ("as-corrected", "as-printed")
 }
 
 

@@ -17,6 +17,7 @@ from haltere.errors import HaltereError
 from haltere.flight import moving
 from haltere.flight.agreement import judge, option
 from haltere.flight.corrections import mounted
+from haltere.flight.door_air import RULES
 from haltere.flight.field import decimal_year, earth_field
 from haltere.flight.log import FlightLog, Stream
 from haltere.flight.names import nearest_column, nearest_stream
@@ -30,14 +31,12 @@ RATE_MIN, RATE_POOR, RATE_HIGH = 10.0, 50.0, 40000.0
 #: No flight has a hole of this many seconds.
 DAY = 86400.0
 #: What estimators read.
-READ = ("imu", "magnetometer", "gnss", "barometer", "airdata", "wind", "power")
+READ = ("imu", "magnetometer", "gnss", "barometer", "power", "rotors", "airdata", "wind", "attitude")
 IMU = ("gyro_x", "gyro_y", "gyro_z", "accel_x", "accel_y", "accel_z")
 #: No small gyro or accelerometer measures more [rad/s, m/s^2].
 RATE_MAX, FORCE_MAX = 100.0, 500.0
 #: No small vehicle draws more [A].
 CURRENT_MAX = 2000.0
-#: No small vehicle, and no wind that it flies in, is faster [m/s].
-SPEED_MAX = 150.0
 Mask = NDArray[np.bool_]
 FloatArray = NDArray[np.float64]
 
@@ -87,8 +86,7 @@ def check(flight: FlightLog, *, upright: bool = True, given: Mapping[str, Any] |
     _check_names(flight, out)
     _check_types(flight)
     _check_imu(flight, out, upright, given or {})
-    rules = (("magnetometer", _check_magnetometer), ("gnss", _check_gnss), ("barometer", _check_barometer),
-             ("airdata", _check_airdata), ("wind", _check_wind))  # fmt: skip
+    rules = (("magnetometer", _check_magnetometer), ("gnss", _check_gnss), ("barometer", _check_barometer), *RULES)
     for name, rule in rules:
         stream = flight.get(name)
         if stream is None:
@@ -97,7 +95,8 @@ def check(flight: FlightLog, *, upright: bool = True, given: Mapping[str, Any] |
         if n == 0:
             out.warnings.append(f"{name}: the log has the stream, but not one sample in it")
             continue
-        cleaned = _check_held(out, name, rule(out, _clean_time(out, name, stream)))
+        cleaned = rule(out, _clean_time(out, name, stream))
+        cleaned = cleaned if name in ("wind", "rotors") else _check_held(out, name, cleaned)
         if len(cleaned):
             out.streams[name] = cleaned
             _check_clock(out, name, cleaned)
@@ -503,16 +502,6 @@ def _check_barometer(out: Checked, stream: Stream) -> Stream:
         remedy = f"it looks like {looks}: --set unit.pressure={looks}" if looks else "check unit.pressure"
         out.warnings.append(f"barometer: expected a pressure of 30000 to 110000 Pa, found a median of {middle:.4g}; not used; {remedy}")
     return out.drop("barometer", stream, ~bad, "pressure impossible in Pa")
-
-
-def _check_airdata(out: Checked, stream: Stream) -> Stream:
-    V = stream.get("airspeed")
-    return out.drop("airdata", stream, np.isfinite(V) & (V >= 0.0) & (V < SPEED_MAX), "airspeed not finite or impossible in m/s")
-
-
-def _check_wind(out: Checked, stream: Stream) -> Stream:
-    there = np.hypot(stream.get("wind_n"), stream.get("wind_e")) < SPEED_MAX
-    return out.drop("wind", stream, there, "not finite or impossible in m/s")
 
 
 def _check_power(flight: FlightLog, out: Checked) -> None:

@@ -13,23 +13,23 @@ import numpy as np
 
 from haltere._jit import jit
 from haltere.core.rotation import Mat, Quat, Vec, quat_mul
-from haltere.strapdown.layout import AID_STATE, EVENT, EVENT_CAPACITY, IMU_CAPACITY, IMU_SAMPLE, MEASUREMENT, STAGE
+from haltere.strapdown.layout import AID_STATE, AIR, EVENT, EVENT_CAPACITY, IMU_CAPACITY, IMU_SAMPLE, MEASUREMENT, N_QUEUES, STAGE
 
 __all__ = ["attitude_covariance", "normalise", "predict", "quaternion_covariance", "quaternion_layout"]
 
-#: Measurements that wait, of each sensor.
-CAPACITY = 64
+#: Sensors that have a memory, and measurements that wait of each that is queued.
+SENSORS, CAPACITY = 18, 64
 
 
 @cache
-def quaternion_layout(sensors: int) -> np.dtype[np.void]:
-    """State record type with memory and a queue for so many sensors."""
+def quaternion_layout() -> np.dtype[np.void]:
+    """State record type."""
     return np.dtype(
         [
             ("t", "f8"),
             ("x", "f8", 4),  # the filter's state
             ("q", "f8", 4),  # the attitude that it gives out: of length one
-            *((name, "f8", (0,)) for name in ("v", "p", "bg", "ba", "baro", "mag")),
+            *((name, "f8", (0,)) for name in ("v", "p", "bg", "ba", "baro", "mag", "wind", "drag", "steady", "vane")),
             ("P", "f8", (4, 4)),
             ("work", "f8", (3, 4, 4)),
             ("w_raw", "f8", 3),
@@ -46,8 +46,7 @@ def quaternion_layout(sensors: int) -> np.dtype[np.void]:
             ("wind_v", "f8", 3),  # wind as given last, and its variance
             ("wind_r", "f8"),
             ("has_wind", "i8"),
-            ("t_rotors", "f8"),  # rotors: mean speed over that in hover
-            ("lift", "f8"),
+            ("air", AIR),  # of it only what goes with the rotors' speed
             ("n_block", "f8"),  # mean of specific force for the drag
             ("t_block", "f8"),
             ("f_block", "f8", 3),
@@ -68,14 +67,14 @@ def quaternion_layout(sensors: int) -> np.dtype[np.void]:
                 "steps", "unaligned", "gaps", "bad", "ring_full", "rows", "nodes", "cov", "aids", "aids_lost", "events", "events_lost",
             )),
             ("event", EVENT, (EVENT_CAPACITY,)),
-            ("aid", AID_STATE, (sensors,)),
+            ("aid", AID_STATE, (SENSORS,)),
             ("imu_head", "i8"),
             ("imu_n", "i8"),
             ("imu", IMU_SAMPLE, (IMU_CAPACITY,)),
             ("a", STAGE, (0,)),
-            ("ring_head", "i8", sensors),
-            ("ring_n", "i8", sensors),
-            ("ring", MEASUREMENT, (sensors, CAPACITY)),
+            ("ring_head", "i8", N_QUEUES),
+            ("ring_n", "i8", N_QUEUES),
+            ("ring", MEASUREMENT, (N_QUEUES, CAPACITY)),
         ],
         align=True,
     )  # fmt: skip
