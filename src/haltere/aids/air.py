@@ -26,11 +26,11 @@ __all__ = [
     "AirOffer",
     "AirRow",
     "air_velocity",
-    "by_quadratic",
     "calm",
     "core_blocks",
     "memory",
     "moves",
+    "quadratic_block",
     "single",
     "wind_block",
     "wind_covariance",
@@ -145,10 +145,12 @@ def wind_block(s: Any, e: Vec, after: float) -> Block:
 
 
 @jit
-def by_quadratic(s: Any, e: Vec) -> float:
-    """What a measurement with ∂h/∂v = e changes with ln c by way of the wind."""
+def quadratic_block(s: Any, e: Vec) -> Block:
+    """Block of ln c of a measurement with ∂h/∂v = e: what it changes by way of the wind, where the state is its force."""
+    if len(s.drag) == 0:
+        return NONE
     n, east = wind_rows(s, wind_n(s))
-    return -e[0] * n[3] - e[1] * east[3]
+    return (15 + len(s.baro) + len(s.mag) + 1, (0.0, 0.0, -e[0] * n[3] - e[1] * east[3]))
 
 
 @jit

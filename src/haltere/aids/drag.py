@@ -12,11 +12,11 @@ from typing import Any
 
 from haltere._jit import constant, jit
 from haltere.aids import rest
-from haltere.aids.air import SILENT, AirOffer, air_velocity, by_quadratic, core_blocks, moves, wind_block
+from haltere.aids.air import SILENT, AirOffer, air_velocity, calm, core_blocks, moves, wind_block, wind_rows
 from haltere.aids.fusing import RUNNING
 from haltere.aids.record import C_DRAG, DRAG, R_NONE
 from haltere.core.earth import STANDARD_DENSITY, density
-from haltere.core.rotation import Vec, dcm, norm, quat_unit
+from haltere.core.rotation import Vec, dcm, dot, norm, quat_unit, tmat_vec
 from haltere.filter.robust import IGG3
 from haltere.strapdown.layout import BA
 
@@ -134,7 +134,10 @@ def offer(s: Any, prm: Any) -> AirOffer:
     speed = norm(v_a)
     drag = drag_force(v_a, mu, c)
     h = (drag[0] + s.drag[2] + s.ba[0], drag[1] + s.drag[3] + s.ba[1], 0.0)
-    first, second = _row(s, C, v_a, speed, mu, c, 0), _row(s, C, v_a, speed, mu, c, 1)
+    n, e = calm(s.steady[0], s.steady[1], math.exp(s.drag[0]), math.exp(s.drag[1]))
+    v_c = tmat_vec(C, (0.5 * (s.v[0] + a.v[0]) - n, 0.5 * (s.v[1] + a.v[1]) - e, 0.5 * (s.v[2] + a.v[2])))
+    by_c = _by_c(s, C, v_c, (n, e, 0.0), mu, c)
+    first, second = _row(s, C, v_a, speed, mu, c, by_c[0], 0), _row(s, C, v_a, speed, mu, c, by_c[1], 1)
     r = prm.noise_drag * prm.noise_drag
     shared = max(1.0, 2.0 * prm.noise_drag_time / dt)
     robust = (IGG3, 2.5, 1.0, shared)
@@ -154,7 +157,21 @@ def offer(s: Any, prm: Any) -> AirOffer:
 
 
 @jit
-def _row(s: Any, C: tuple[Vec, Vec, Vec], v_a: Vec, speed: float, mu: float, c: float, axis: int) -> Any:
+def _by_c(s: Any, C: tuple[Vec, Vec, Vec], v_a: Vec, W: Vec, mu: float, c: float) -> tuple[float, float]:
+    """Derivatives of drag along body x and y against ln c at a constant A, in the mean wind ``W``.
+
+    In the wind as it is just estimated they would follow the noise that the innovation holds too, and c would be found from that.
+    """
+    speed = norm(v_a)
+    n, e = wind_rows(s, W)
+    u = tmat_vec(C, (n[3], e[3], 0.0))
+    k = c * dot(v_a, u) / max(speed, 1e-6)
+    along = mu + c * speed
+    return along * u[0] + k * v_a[0] - c * speed * v_a[0], along * u[1] + k * v_a[1] - c * speed * v_a[1]
+
+
+@jit
+def _row(s: Any, C: tuple[Vec, Vec, Vec], v_a: Vec, speed: float, mu: float, c: float, by_c: float, axis: int) -> Any:
     """Row of drag along a body axis (0: x, 1: y), see `haltere.aids.air`."""
     k = c * v_a[axis] / max(speed, 1e-6)
     on = -mu - c * speed
@@ -162,5 +179,5 @@ def _row(s: Any, C: tuple[Vec, Vec, Vec], v_a: Vec, speed: float, mu: float, c: 
     theta, vel, e = core_blocks(C, v_a, d)
     x, y = (1.0, 0.0) if axis == 0 else (0.0, 1.0)
     o = 15 + len(s.baro) + len(s.mag) + len(s.wind)
-    coefficients = (o + 1, (-c * speed * v_a[axis] + by_quadratic(s, e), x, y))
+    coefficients = (o + 1, (by_c, x, y))
     return (theta, vel, (BA, (x, y, 0.0)), wind_block(s, e, -mu * v_a[axis]), coefficients)

@@ -364,13 +364,15 @@ _WIND_ATTITUDE = tuple(key for key in KEYS if key.startswith("wind_attitude."))
 #: A wind taken for true, which only the published filter of wind-attitude needs.
 _GIVEN_WIND = tuple(f"wind.{key}" for key in ("n", "e", "d", "speed", "from", "sd"))
 #: What only an estimator with wind has.
+_AIR_TAILS = (
+    "wind wind_d wind_mean air_walk airspeed aoa sideslip airdata_time no_sideslip drag drag_time given_wind air airdata vanes "
+    "airspeed_scale vane"
+).split()
 _AIR = tuple(
-    key for key in KEYS
-    if not key.startswith("delay.") and (key.startswith(("air.", "drag.", "wind.")) or key.partition(".")[2] in (
-        "wind", "wind_d", "wind_mean", "air_walk", "airspeed", "aoa", "sideslip", "airdata_time", "no_sideslip", "drag", "drag_time", "given_wind",
-        "air", "airdata", "vanes", "airspeed_scale", "vane",
-    ))
-)  # fmt: skip
+    key
+    for key in KEYS
+    if not key.startswith("delay.") and (key.startswith(("air.", "drag.", "wind.")) or key.partition(".")[2] in _AIR_TAILS)
+)
 _NO_AIR: dict[str, Value] = {"aid.drag": "off", "aid.airdata": "off", "aid.vanes": "off", "aid.no_sideslip": "off", "aid.wind": "off"}
 #: What an estimator sets differently from the defaults above.
 _OVERRIDES: dict[str, dict[str, Value]] = {

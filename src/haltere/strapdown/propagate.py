@@ -207,9 +207,9 @@ def gust_keeps(prm: Any, dt: float) -> float:
 def blow(s: Any, prm: Any, o: int, dt: float) -> None:
     """Advance wind and coefficients of the air, from error state ``o`` on.
 
-    A wind W of its own walks. One that drag shows is gusts about a slow mean, dA = -(A - Ā) dt/τ + noise, both as the specific force on a
-    vehicle at hover, A = µW + c|W|W (see `haltere.aids.air`), the noise of W times µ + 2c|W|: for a wind that only walked, drag that follows the vehicle's motion would look like wind that returns, and µ would be found wrong
-    (theory-amendments.md §2).
+    A wind W of its own walks. One that drag shows is gusts about a slow mean, dA = -(A - Ā) dt/τ + noise, both as the specific force
+    on a vehicle at hover, A = µW + c|W|W (see `haltere.aids.air`), the noise of W times µ + 2c|W|: for a wind that only walked, drag
+    that follows the vehicle's motion would look like wind that returns, and µ would be found wrong (theory-amendments.md §2).
     """
     P, n = s.P, s.P.shape[0]
     if len(s.drag) == 0:
