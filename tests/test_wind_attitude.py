@@ -276,7 +276,7 @@ def test_variances_of_vanes(V: float, aoa: float, slip: float, sd: float, sd_aoa
     for k, (s, a, b) in enumerate(steps):
         column = (s * np.array([np.cos(a) * np.cos(b), np.sin(b), np.sin(a) * np.cos(b)])).imag / 1e-30
         np.testing.assert_allclose(J[:, k], column, atol=1e-12)
-    want = J @ np.diag([sd**2, sd_aoa**2 + (sd / V) ** 2, sd_slip**2 + (sd / V) ** 2]) @ J.T
+    want = J @ np.diag([sd**2, sd_aoa**2 + (sd / (V * np.cos(slip))) ** 2, sd_slip**2 + (sd / V) ** 2]) @ J.T
     np.testing.assert_allclose(air.air_covariance(v, r), want, rtol=1e-9, atol=1e-10)
 
 

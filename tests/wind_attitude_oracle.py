@@ -207,7 +207,7 @@ class Filter:
         p = np.array([V, aoa, slip])
         J = np.array([vector(p + 1e-30j * e).imag / 1e-30 for e in np.eye(3)]).T
         sd = self.keys["noise.airspeed"]
-        polar = np.diag([sd**2, self.keys["noise.aoa"] ** 2 + (sd / V) ** 2, self.keys["noise.sideslip"] ** 2])
+        polar = np.diag([sd**2, self.keys["noise.aoa"] ** 2 + (sd / (V * np.cos(slip))) ** 2, self.keys["noise.sideslip"] ** 2])
         polar[2, 2] = self.keys["noise.sideslip"] ** 2 + (sd / V) ** 2
         C = matrix(unit)
         R = J @ polar @ J.T + C.T @ (np.diag(self.velocity[2]) + (self.wind_r + (3.0 * age) ** 2) * np.eye(3)) @ C

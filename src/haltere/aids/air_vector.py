@@ -21,13 +21,14 @@ ENOUGH = 3.0
 def from_vanes(airspeed: float, aoa: float, sideslip: float, sd: float, sd_aoa: float, sd_sideslip: float) -> tuple[Vec, Vec]:
     """(15): v = V [cosα cosβ, sinβ, sinα cosβ], and its variances in air axes.
 
-    Angles of vanes in a flow that itself is only known to σ_V are worth no more than σ_V/V: σ_α² + (σ_V/V)², β alike
-    (theory-amendments.md §11). Without that the variance across vanishes with V.
+    Angles of vanes in a flow that itself is only known to σ_V are worth no more than σ_V/V: σ_β² + (σ_V/V)², and
+    σ_α² + (σ_V/(V cosβ))² of its part in the plane of symmetry (theory-amendments.md §11). Without that the variance across vanishes
+    with V.
     """
     ca, sa, cb, sb = math.cos(aoa), math.sin(aoa), math.cos(sideslip), math.sin(sideslip)
     r, v2 = sd * sd, airspeed * airspeed
     v = (airspeed * ca * cb, airspeed * sb, airspeed * sa * cb)
-    return v, (r, cb * cb * (v2 * sd_aoa * sd_aoa + r), v2 * sd_sideslip * sd_sideslip + r)
+    return v, (r, cb * cb * v2 * sd_aoa * sd_aoa + r, v2 * sd_sideslip * sd_sideslip + r)
 
 
 @jit

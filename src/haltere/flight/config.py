@@ -387,7 +387,7 @@ _OVERRIDES: dict[str, dict[str, Value]] = {
         "aid.motor_field": "off", "two_stage.radial": 0.05, "two_stage.memory": 10.0,
         **_NO_AIR,
     },
-    "wind-attitude": {"air.moves": "all"},
+    "wind-attitude": {"air.moves": "all", "aid.magnetometer": "3-axis"},
 }  # fmt: skip
 _NO_GATE = 1e6
 #: What a preset of an estimator sets differently from its `default`. The source has no innovation tests.
