@@ -257,10 +257,12 @@ def _wind_triangle(checked: Checked, config: Config) -> list[Part]:
             parts.append((ROTORS, rotors.t[there], np.column_stack([total[there], nan[:, :2]]), nan))
     if config["wind_attitude.air"] != "off":
         lacks = [] if checked.streams.get("gnss") is not None and config["aid.gnss"] == "on" else ["velocity from GNSS"]
-        if wind is None and steady_wind(config.values) is None:
+        if wind is None and steady_wind(config.values) is None and config["wind_attitude.rows"] == "jacobian":
             lacks.append("wind (keys wind.n and wind.e or wind.speed and wind.from, or a stream wind)")
         if lacks:
             told.append(f"wind triangle: no {' and no '.join(lacks)}; attitude is that of gravity and field alone")
+    if config["wind_attitude.angles"] == "arctan":
+        told.append("roll and yaw are those of the printed arc tangents (3): wrong by half a turn in half the circle; as-corrected is not")
     return parts
 
 
