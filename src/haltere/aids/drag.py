@@ -13,7 +13,7 @@ from typing import Any
 from haltere._jit import constant, jit
 from haltere.aids import rest
 from haltere.aids.air import SILENT, AirOffer, air_velocity, calm, core_blocks, moves, wind_block, wind_rows
-from haltere.aids.fusing import RUNNING
+from haltere.aids.fusing import ANY_TURN, ONLY_AIR, ONLY_WIND, RUNNING, WITH_DRAG
 from haltere.aids.record import C_DRAG, DRAG, R_NONE
 from haltere.core.earth import STANDARD_DENSITY, density
 from haltere.core.rotation import Vec, dcm, dot, norm, quat_unit, tmat_vec
@@ -28,6 +28,9 @@ LEAST_THRUST = 0.3
 LIFTED, FAST = 1.5, 2.0
 #: How long a rotor speed is believed [s], and how slowly its proportion to thrust is followed [samples at 10 Hz].
 STALE, FOLLOW = 0.5, 200
+#: Drag is learnt from motion faster than this [m/s], and by no other measurement: what a vehicle that hovers makes of gusts moves with
+#: them, and would be taken for less drag.
+LEARNT = 2.0
 TWO = constant(2)
 
 
@@ -141,19 +144,11 @@ def offer(s: Any, prm: Any) -> AirOffer:
     r = prm.noise_drag * prm.noise_drag
     shared = max(1.0, 2.0 * prm.noise_drag_time / dt)
     robust = (IGG3, 2.5, 1.0, shared)
-    return (
-        TWO,
-        C_DRAG,
-        (f[0], f[1], 0.0),
-        h,
-        (r, r, 1.0),
-        (first, second, second),
-        prm.gate_air,
-        prm.timeout_air,
-        R_NONE,
-        moves(s, prm),
-        robust,
-    )
+    alone, slow = moves(s, prm) == ONLY_AIR, s.v[0] * s.v[0] + s.v[1] * s.v[1] < LEARNT * LEARNT
+    turn = (ONLY_WIND if slow else ONLY_AIR) if alone else (ANY_TURN if slow else WITH_DRAG)
+    z = (f[0], f[1], 0.0)
+    rows = (first, second, second)
+    return TWO, C_DRAG, z, h, (r, r, 1.0), rows, prm.gate_air, prm.timeout_air, R_NONE, turn, robust
 
 
 @jit

@@ -45,7 +45,7 @@ from haltere.estimators.step import (
     write_wind_covariance,
 )
 from haltere.strapdown.optional import put_optional
-from haltere.strapdown.propagate import gust_keeps, left_F, mechanise, propagate, transition
+from haltere.strapdown.propagate import gust_keeps, left_F, mechanise, propagate, transition, unseen
 
 __all__ = ["BUFFER", "node_width", "smooth", "smoothed"]
 
@@ -131,15 +131,19 @@ def step_forward(s: Any, prm: Any, w: Any, k: int, w0: Vec, f0: Vec, w1: Vec, f1
             w.phi[k, 0, i, j], w.phi[k, 1, i, j], w.phi[k, 2, i, j] = D[i][j], A[i][j], B[i][j]
     w.dt[k] = dt
     propagate(s, prm, C, D, A, B, dt)
+    if prm.imu_mean == 0.0:
+        unseen(s, prm, w0, f0, w1, f1, dt)
     m = w.W.shape[0]
     for j in range(m):
         left_F(w.system, m + j, D, A, B, dt)
     if len(s.steady) > 0:
         o, keep = first_of_wind(s), gust_keeps(prm, dt)
         c = o + len(s.wind) + len(s.drag)
-        for i in range(2):
+        for i in range(len(s.wind)):
             for j in range(m):
-                w.system.P[o + i, m + j] = keep * w.system.P[o + i, m + j] + (1.0 - keep) * w.system.P[c + i, m + j]
+                w.system.P[o + i, m + j] *= keep
+                if i < 2:
+                    w.system.P[o + i, m + j] += (1.0 - keep) * w.system.P[c + i, m + j]
 
 
 @jit
@@ -202,8 +206,9 @@ def back(s: Any, prm: Any, w: Any, k: int) -> None:
     if len(s.steady) > 0:
         o, keep = first_of_wind(s), gust_keeps(prm, dt)
         c = o + len(s.wind) + len(s.drag)
-        for i in range(2):
-            u[c + i] += (1.0 - keep) * u[o + i]
+        for i in range(len(s.wind)):
+            if i < 2:
+                u[c + i] += (1.0 - keep) * u[o + i]
             u[o + i] *= keep
 
 

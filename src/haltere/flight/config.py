@@ -86,6 +86,12 @@ KEYS: dict[str, Key] = {
     "noise.gyro_scale": Key(
         0.005, "1", "Gyro error in proportion to the rate (scale, misalignment), 1 sigma, taken as noise that lasts a second.", low=0.0
     ),
+    "noise.between": Key(
+        0.2,
+        "1",
+        "Share of the change between two IMU samples that the mean between them may be off by, 1 sigma. It matters at low rates.",
+        low=0.0,
+    ),
     "noise.accel": _positive(0.035, "m/s^2/sqrt(Hz)", "Accelerometer white noise density, vibration included."),
     "noise.gyro_bias": _positive(1e-4, "rad/s/sqrt(s)", "Walk of the gyro bias."),
     "noise.accel_bias": _positive(3e-4, "m/s^2/sqrt(s)", "Walk of the accelerometer bias."),
@@ -111,20 +117,16 @@ KEYS: dict[str, Key] = {
         "m/s",
         "Fake velocity of ahrs, 1 sigma at 5 Hz: worth 2 m/s that last a second. Lower trusts gravity more, accelerations less.",
     ),
-    "noise.wind": _positive(
-        0.3, "m/s/sqrt(s)", "Walk of the horizontal wind that air data show. Higher follows gusts sooner, and is less sure."
-    ),
-    "noise.wind_mean": _positive(0.05, "m/s/sqrt(s)", "Walk of the mean wind of a multirotor, which gusts return to."),
     "wind.n": Key(math.nan, "m/s", "Wind taken for true, where it blows to, north. Default: not given.", low=-100.0, high=100.0),
     "wind.e": Key(math.nan, "m/s", "The same, east.", low=-100.0, high=100.0),
     "wind.d": Key(0.0, "m/s", "The same, down.", low=-50.0, high=50.0),
     "wind.speed": Key(math.nan, "m/s", "Instead of wind.n and wind.e, as a station gives it: its speed,", low=0.0, high=100.0),
     "wind.from": Key(math.nan, "rad", "and where it comes from, clockwise from true north.", low=-6.2832, high=6.2832),
     "wind.sd": _positive(1.0, "m/s", "1 sigma of each of its components, gusts included."),
-    "wind.gust": _positive(0.3, "m/s", "Gusts of a multirotor's wind, 1 sigma in calm air."),
+    "noise.wind_mean": _positive(0.05, "m/s/sqrt(s)", "Walk of the mean wind, which gusts return to."),
+    "wind.gust": _positive(0.3, "m/s", "Gusts, 1 sigma an axis in calm air; vertical ones are half of it."),
     "wind.turbulence": Key(0.2, "1", "Gusts more in proportion to the mean wind.", low=0.0, high=2.0),
     "wind.gust_time": _positive(3.0, "s", "How long a gust lasts."),
-    "noise.wind_d": _positive(0.1, "m/s/sqrt(s)", "Walk of the vertical wind."),
     "noise.air_walk": _positive(
         2e-3, "1/sqrt(s)", "Walk of what air data depend on: relative for drag and airspeed scale, in m/s^2 and rad for offsets."
     ),
@@ -247,7 +249,6 @@ KEYS: dict[str, Key] = {
     "init.baro_bias": _positive(3.0, "m", "1 sigma of the barometer offset."),
     "init.mag_offset": _positive(5.0, "uT", "1 sigma of the magnetometer's offset, where it is estimated."),
     "init.wind": _positive(5.0, "m/s", "1 sigma of each component of the horizontal wind, which begins at none."),
-    "init.wind_d": _positive(1.0, "m/s", "1 sigma of the vertical wind."),
     "init.airspeed_scale": _positive(0.1, "1", "Relative 1 sigma of the airspeed's scale."),
     "init.vane": _positive(3.0 * DEG, "rad", "1 sigma of a vane's offset."),
     "rest.gyro": _positive(0.02, "rad/s", "At rest the rate's standard deviation over a second is below this."),
@@ -365,8 +366,7 @@ _WIND_ATTITUDE = tuple(key for key in KEYS if key.startswith("wind_attitude."))
 _GIVEN_WIND = tuple(f"wind.{key}" for key in ("n", "e", "d", "speed", "from", "sd"))
 #: What only an estimator with wind has.
 _AIR_TAILS = (
-    "wind wind_d wind_mean air_walk airspeed aoa sideslip airdata_time no_sideslip drag drag_time given_wind air airdata vanes "
-    "airspeed_scale vane"
+    "wind wind_mean air_walk airspeed aoa sideslip airdata_time no_sideslip drag drag_time given_wind air airdata vanes airspeed_scale vane"
 ).split()
 _AIR = tuple(
     key
