@@ -1,7 +1,9 @@
 """The experiment of the filter of source W rebuilt in simulation: attitude in gusty wind, as printed, as corrected, and ours.
 
-``python docs/_wind_attitude.py --seeds 100 --out docs/_data/wind_attitude.json`` makes the tables of the page on it; the page shows them
-and runs one flight. Conditions are those of theory.md §3.5 with every rate and noise that it leaves open stated in `CONDITIONS`.
+``python docs/_wind_attitude.py --seeds 100 --out docs/_data/wind_attitude.json`` makes the tables of the page on it, and
+``python docs/_wind_attitude.py --real .../umn_thor/thor_flight75.mat --out docs/_data/wind_attitude_thor.json`` that of a real flight;
+the page shows them and runs one flight. Conditions are those of theory.md §3.5 with every rate and noise that it leaves open stated in
+`CONDITIONS`.
 """
 
 from __future__ import annotations
@@ -10,6 +12,7 @@ import argparse
 import datetime
 import json
 import platform
+import sys
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
@@ -21,6 +24,7 @@ import haltere
 from haltere.flight.field import earth_field
 from haltere.flight.log import FlightLog, Home, Stream
 from haltere.metrics.attitude import conjugate, multiply, rotation_vector, slerp
+from haltere.metrics.errors import error_series
 
 Array = NDArray[np.float64]
 
@@ -158,16 +162,56 @@ def table(results: Mapping[str, Any], which: str = "rows") -> str:
     return "\n".join(lines)
 
 
+def real(path: Path) -> dict[str, Any]:
+    """UMN Thor, flight 75 (see the tests' converter): RMS against the aircraft's own filter while it flies.
+
+    There is no station: the wind that the published filter is given is the median of what ``default`` finds over that time.
+    """
+    sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests"))
+    from converters_air import umn_thor
+
+    flight = umn_thor(path, magnetometer=True)
+    air = flight["airdata"]
+    fast = air.t[np.isfinite(air["airspeed"]) & (air["airspeed"] > 8.0)]
+    begins, ends = float(fast[0]) + 30.0, float(fast[-1]) - 10.0
+    ours = haltere.run(flight, "wind-attitude", scored=False)
+    inside = (ours.t > begins) & (ours.t < ends)
+    n, e = (float(np.median(ours[c][inside])) for c in ("wind_n", "wind_e"))
+    given = {"wind.n": n, "wind.e": e}
+    rows = []
+    for name, preset, keys in (
+        ("as-printed", "as-printed", given), ("as-printed, atan2", "as-printed", {**given, "wind_attitude.angles": "atan2"}),
+        ("as-corrected", "as-corrected", given), ("as-corrected, told of no wind", "as-corrected", {"wind.n": 0.0, "wind.e": 0.0}),
+        ("as-corrected, no wind rows", "as-corrected", {"aid.airdata": "off"}), ("default", "default", {}),
+    ):  # fmt: skip
+        series = error_series(haltere.run(flight, "wind-attitude", preset=preset, set=keys, scored=False), flight["onboard"])
+        rms = {k: float(np.degrees(np.sqrt(np.mean(x[(t > begins) & (t < ends)] ** 2)))) for k, (t, x) in series.items()}
+        rows.append({"filter": name, **{k: rms[k] for k in ("roll", "pitch", "yaw", "tilt")}})
+    return {"version": haltere.__version__, "begins": begins, "ends": ends, "wind": [n, e], "rows": rows}
+
+
+def real_table(results: Mapping[str, Any]) -> str:
+    """RMS against the aircraft's own filter [deg]."""
+    lines = ["| filter | roll | pitch | yaw | tilt |", "|---|---|---|---|---|"]
+    lines += [f"| {r['filter']} | {r['roll']:.1f}° | {r['pitch']:.1f}° | {r['yaw']:.1f}° | {r['tilt']:.1f}° |" for r in results["rows"]]
+    return "\n".join(lines)
+
+
 def main() -> None:
     """Make the tables anew."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--seeds", type=int, default=100)
     parser.add_argument("--first", type=int, default=1)
+    parser.add_argument("--real", type=Path)
     parser.add_argument("--out", type=Path)
     given = parser.parse_args()
-    results = measure(range(given.first, given.first + given.seeds), lambda text: print(text, flush=True))
+    if given.real is not None:
+        results = real(given.real)
+        print(real_table(results))
+    else:
+        results = measure(range(given.first, given.first + given.seeds), lambda text: print(text, flush=True))
+        print(table(results), table(results, "misprints"), results["order"], sep="\n\n")
     results |= {"date": datetime.datetime.now(datetime.UTC).date().isoformat(), "machine": platform.machine()}
-    print(table(results), table(results, "misprints"), results["order"], sep="\n\n")
     if given.out is not None:
         given.out.parent.mkdir(parents=True, exist_ok=True)
         given.out.write_text(json.dumps(results, indent=1) + "\n", encoding="utf-8")

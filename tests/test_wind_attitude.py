@@ -660,12 +660,12 @@ def test_command_line_and_report(flight: FlightLog, tmp_path: Path, monkeypatch:
 
 
 def test_compare(flight: FlightLog) -> None:
-    """All three presets beside `navigator`, in one table; `default` gives wind, the published ones attitude alone."""
+    """All three presets beside `navigator`, in one table; `default` gives velocity too, the published ones attitude alone."""
     names = ["navigator", *(f"wind-attitude@{preset}" for preset in config.PRESETS["wind-attitude"])]
     solutions = haltere.compare(flight, names, peers="none").summary["solutions"]
     ours = {name: row["errors"] for name, row in solutions.items() if name.startswith(("navigator", "wind-attitude"))}
     assert len(ours) == 4
-    assert sum("wind_n" in row for row in ours.values()) == 2
+    assert sum("vel_n" in row for row in ours.values()) == 2
     assert all("roll_deg" in row for row in ours.values())
 
 
@@ -691,24 +691,39 @@ def test_backwards_through_the_air(flight: FlightLog) -> None:
 # The experiment
 
 
-def test_experiment_of_the_source() -> None:
-    """With a few seeds what the page says must hold (its own figures are of a hundred): as printed worse than corrected worse than ours."""
-    results = _wind_attitude.measure(range(1, 4))
+def _holds(seeds: range) -> dict[tuple[str, str], dict[str, float]]:
+    """What the page says must hold: as printed worse than corrected worse than ours, in every flight. Gives the cells."""
+    results = _wind_attitude.measure(seeds)
     cells = {(r["flight"], r["filter"]): r for r in results["rows"]}
-    assert results["order"] == {"gentle": 3, "aggressive": 3}
+    assert results["order"] == {"gentle": len(seeds), "aggressive": len(seeds)}
     for title in ("gentle", "aggressive"):
         printed, plain, corrected, bare, default = (cells[title, f[0]] for f in _wind_attitude.FILTERS)
         for a in "xyz":
             assert default[a] < 0.3 * corrected[a]
-            assert corrected[a] < plain[a] < printed[a]
         assert corrected["z"] < bare["z"]  # the wind rows help heading
+        assert corrected["z"] < plain["z"] < printed["z"]
         assert max(default["x"], default["y"]) < 0.3
-        assert default["z"] < 0.5
-        assert default["wind"] < 0.4
     one = {(r["flight"], r["filter"]): r["z"] for r in results["misprints"]}
     assert one["gentle", "residual (25)"] == pytest.approx(one["gentle", "none"], rel=0.1)
-    assert one["gentle", "residual (25), length alone restored"] > 1.3 * one["gentle", "length alone restored"]
+    assert one["gentle", "residual (25), length alone restored"] > 1.2 * one["gentle", "length alone restored"]
     assert one["aggressive", "no test of what is gravity"] > 3.0 * one["aggressive", "none"]
+    assert _wind_attitude.table(results).count("\n") == len(_wind_attitude.FILTERS) + 1
+    return cells
+
+
+def test_experiment_of_the_source() -> None:
+    """One seed; the page's own figures are of a hundred."""
+    _holds(range(1, 2))
+
+
+@pytest.mark.slow
+def test_experiment_of_the_source_over_seeds() -> None:
+    """Other seeds than the page's: the bounds on the default that hold over a hundred, with the slack of twelve."""
+    cells = _holds(range(501, 513))
+    for title in ("gentle", "aggressive"):
+        default = cells[title, "default"]
+        assert default["z"] < 0.45
+        assert default["wind"] < 0.4
 
 
 def test_published_table_is_of_this_experiment() -> None:
@@ -724,3 +739,22 @@ def test_published_table_is_of_this_experiment() -> None:
             assert max(row["x"], row["y"]) <= 0.3
             assert row["z"] <= 0.4
             assert row["wind"] < 0.35
+
+
+# Real flight
+
+
+def test_thor(shared_data: Path) -> None:
+    """An aeroplane in 6 m/s of wind, against its own filter: the wind rows help on real air data, and the order is that of simulation.
+
+    Bounds: roll and pitch of the default within 1.5 degrees, as its own filter is asked elsewhere; else only the order, with a margin.
+    """
+    rows = {r["filter"]: r for r in _wind_attitude.real(shared_data / "umn_thor" / "thor_flight75.mat")["rows"]}
+    ours, corrected, bare = rows["default"], rows["as-corrected"], rows["as-corrected, no wind rows"]
+    assert max(ours["roll"], ours["pitch"]) < 1.5
+    for angle in ("tilt", "yaw"):
+        assert ours[angle] < 0.7 * corrected[angle]
+        assert corrected[angle] < 0.8 * bare[angle]
+        assert corrected[angle] < 0.8 * rows["as-printed, atan2"][angle]
+    published = json.loads((DOCS / "_data" / "wind_attitude_thor.json").read_text(encoding="utf-8"))
+    assert [r["filter"] for r in published["rows"]] == list(rows)
