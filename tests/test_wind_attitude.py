@@ -422,10 +422,10 @@ def test_filter_is_the_plain_one(name: str, flight: FlightLog) -> None:
         np.testing.assert_allclose(aids["innovation_sd"][mine], sd, rtol=1e-7)
 
 
-@pytest.mark.parametrize("preset", PRESETS)
-def test_online_is_offline(preset: str, flight: FlightLog) -> None:
+@pytest.mark.parametrize(("preset", "source"), [("as-corrected", "vanes"), ("as-printed", "vanes"), ("as-corrected", "drag")])
+def test_online_is_offline(preset: str, source: str, flight: FlightLog) -> None:
     """The same numbers sample by sample, through a saved state too; ``now`` is the state once the horizon has come there."""
-    solution = haltere.run(flight, "wind-attitude", preset=preset, set={**WIND, "delay.airdata": 0.05})
+    solution = haltere.run(flight, "wind-attitude", preset=preset, set={**WIND, "delay.airdata": 0.05, "wind_attitude.air": source})
     est = Estimator("wind-attitude", solution.config)
     offers = [
         ("gnss", f.t, [{c: f[c][k] for c in f.names if c not in ("t", "num_sats")} for k in range(len(f))]) for f in (flight["gnss"],)
@@ -433,6 +433,9 @@ def test_online_is_offline(preset: str, flight: FlightLog) -> None:
     offers += [("magnetometer", flight["magnetometer"].t, list(flight["magnetometer"].vector("mag")))]
     air_stream = flight["airdata"]
     offers += [("airdata", air_stream.t, list(np.column_stack([air_stream[c] for c in ("airspeed", "aoa", "sideslip")])))]
+    if source == "drag":
+        rotors = flight["rotors"]
+        offers[-1] = ("rotors", rotors.t, list(np.column_stack([rotors[c] for c in rotors.names if c.startswith("speed_")])))
     queue = sorted((t, order, k, name, values[k]) for order, (name, times, values) in enumerate(offers) for k, t in enumerate(times))
     imu, j, rows, predicted = flight["imu"], 0, {}, {}
     gyro, accel = imu.vector("gyro"), imu.vector("accel")
@@ -463,6 +466,7 @@ def test_online_is_offline(preset: str, flight: FlightLog) -> None:
     assert state.P.shape == (4, 4)
     assert state.vel_n.shape == (0,)
     assert est.discarded.get("airdata", {}) == solution.summary["streams"]["airdata"]["discarded"]
+    assert {"vanes": "airdata", "drag": "drag"}[source] in solution.aids["sensor"]
 
 
 def test_what_it_gives(flight: FlightLog) -> None:
