@@ -368,6 +368,14 @@ def test_station(direction: float, n: float, e: float) -> None:
     np.testing.assert_allclose(steady_wind(config.resolve("wind-attitude", "as-printed", keys).values), (n, e, 0.0), atol=1e-4)
 
 
+def test_a_wind_as_keys_or_as_a_stream(flight: FlightLog) -> None:
+    """The keys and what `--wind` makes of a constant are the same wind."""
+    keys = haltere.run(flight, "wind-attitude", preset="as-corrected", set=WIND)
+    stream = haltere.run(haltere.with_wind(flight, "4,2", sd=0.8), "wind-attitude", preset="as-corrected")
+    np.testing.assert_array_equal(keys["q_z"], stream["q_z"])
+    assert (keys.aids["sensor"] == "airdata").any()
+
+
 # The filter
 
 

@@ -13,11 +13,12 @@ from typing import Any
 from haltere._jit import constant, jit
 from haltere.aids import rest
 from haltere.aids.air import SILENT, AirOffer, air_velocity, calm, core_blocks, moves, wind_block, wind_rows
-from haltere.aids.fusing import ANY_TURN, ONLY_AIR, ONLY_WIND, RUNNING, WITH_DRAG
+from haltere.aids.fusing import ANY_TURN, NO_GATE, ONLY_AIR, ONLY_WIND, RUNNING, WITH_DRAG
 from haltere.aids.record import C_DRAG, DRAG, R_NONE
 from haltere.core.earth import STANDARD_DENSITY, density
 from haltere.core.rotation import Vec, dcm, dot, norm, quat_unit, tmat_vec
-from haltere.filter.robust import IGG3
+from haltere.filter.robust import PLAIN
+from haltere.filter.update import project, variance
 from haltere.strapdown.layout import BA
 
 __all__ = ["airborne", "density_ratio", "drag_force", "forget", "gather", "hear", "offer", "spin"]
@@ -28,6 +29,8 @@ LEAST_THRUST = 0.3
 LIFTED, FAST = 1.5, 2.0
 #: How long a rotor speed is believed [s], and how slowly its proportion to thrust is followed [samples at 10 Hz].
 STALE, FOLLOW = 0.5, 200
+#: Innovations beyond so many sigma are a step of the wind.
+STEPPED = 3.5
 #: Drag is learnt from motion faster than this [m/s], and by no other measurement: what a vehicle that hovers makes of gusts moves with
 #: them, and would be taken for less drag.
 LEARNT = 2.0
@@ -143,12 +146,33 @@ def offer(s: Any, prm: Any) -> AirOffer:
     first, second = _row(s, C, v_a, speed, mu, c, by_c[0], 0), _row(s, C, v_a, speed, mu, c, by_c[1], 1)
     r = prm.noise_drag * prm.noise_drag
     shared = max(1.0, 2.0 * prm.noise_drag_time / dt)
-    robust = (IGG3, 2.5, 1.0, shared)
+    robust = (PLAIN, NO_GATE, 1.0, shared)
     alone, slow = moves(s, prm) == ONLY_AIR, s.v[0] * s.v[0] + s.v[1] * s.v[1] < LEARNT * LEARNT
     turn = (ONLY_WIND if slow else ONLY_AIR) if alone else (ANY_TURN if slow else WITH_DRAG)
     z = (f[0], f[1], 0.0)
+    widen(s, first, second, (f[0] - h[0], f[1] - h[1]), r)
     rows = (first, second, second)
-    return TWO, C_DRAG, z, h, (r, r, 1.0), rows, prm.gate_air, prm.timeout_air, R_NONE, turn, robust
+    return TWO, C_DRAG, z, h, (r, r, 1.0), rows, prm.gate_drag, prm.timeout_drag, R_NONE, turn, robust
+
+
+@jit
+def widen(s: Any, first: Any, second: Any, e: tuple[float, float], r: float) -> None:
+    """Let wind and mean wind go where drag says when an innovation is beyond what gusts explain: the wind has stepped.
+
+    The innovation's own square is added to their variances, as of one change of both.
+    """
+    project(s, first)
+    beyond = e[0] * e[0] > STEPPED * STEPPED * (variance(s, first) + r)
+    project(s, second)
+    beyond = beyond or e[1] * e[1] > STEPPED * STEPPED * (variance(s, second) + r)
+    if beyond:
+        P, o = s.P, 15 + len(s.baro) + len(s.mag)
+        m, more = o + len(s.wind) + len(s.drag), e[0] * e[0] + e[1] * e[1]
+        for i in range(2):
+            P[o + i, o + i] += more
+            P[m + i, m + i] += more
+            P[o + i, m + i] += more
+            P[m + i, o + i] += more
 
 
 @jit
