@@ -119,8 +119,8 @@ class InitialState:
     q_nb, vel_n, pos_n, gyro_bias_b, accel_bias_b
         Nominal state, SI units.
     P
-        Covariance (n, n) in the order of `State.P`; of the published filter of `wind-attitude` that of the attitude error alone is used,
-        the first three rows and columns.
+        Covariance (n, n) in the order of `State.P`, or of it without wind and coefficients of the air, which then begin as configured.
+        The published filter of `wind-attitude` takes only that of the attitude error, the first three rows and columns.
     baro_bias
         Barometer offset [m].
     """
@@ -155,7 +155,10 @@ def new_state(config: Config, initial: InitialState | None = None) -> NDArray[np
     if quaternion:
         _published(record, config)
     if initial is not None:
-        (_begin_quaternion if quaternion else _begin_from)(record, initial)
+        if quaternion:
+            _begin_quaternion(record, initial)
+        else:
+            _begin_from(record, config, initial)
     return record
 
 
@@ -201,10 +204,12 @@ def _sizes(config: Config) -> dict[str, int]:
     }
 
 
-def _begin_from(record: NDArray[np.void], initial: InitialState) -> None:
+def _begin_from(record: NDArray[np.void], config: Config, initial: InitialState) -> None:
     n = record["P"].shape[1]
     P = np.asarray(initial.P, dtype=np.float64)
-    if P.shape != (n, n):
+    sizes = _sizes(config)
+    told = CORE + sizes["baro"] + sizes["mag"]  # without the states of the air: these begin as configured
+    if P.shape not in ((n, n), (told, told)):
         raise HaltereError(f"an initial covariance of shape ({n}, {n})", f"{P.shape}", "initial state", "see State.P for the order")
     if not np.allclose(P, P.T, rtol=1e-9, atol=1e-15) or np.linalg.eigvalsh(P).min() <= 0.0:
         raise HaltereError("a symmetric positive covariance", "one that is not", "initial state")
@@ -218,7 +223,8 @@ def _begin_from(record: NDArray[np.void], initial: InitialState) -> None:
     if n > CORE:
         record["baro"][0, 0] = initial.baro_bias
     record["q"][0] /= np.linalg.norm(record["q"][0])
-    record["P"][0] = P
+    kernels.begin_air(record, parameters(config))
+    record["P"][0, : len(P), : len(P)] = P
     for field in ("q", "v", "p", "bg", "ba"):
         record["a"][field][0] = record[field][0]
     record["a"]["P"][0] = P[:CORE, :CORE]
