@@ -223,7 +223,7 @@ def _begin_from(record: NDArray[np.void], config: Config, initial: InitialState)
     if n > CORE:
         record["baro"][0, 0] = initial.baro_bias
     record["q"][0] /= np.linalg.norm(record["q"][0])
-    kernels.begin_air(record, parameters(config))
+    kernels_of(record).begin_air(record, parameters(config))
     record["P"][0, : len(P), : len(P)] = P
     for field in ("q", "v", "p", "bg", "ba"):
         record["a"][field][0] = record[field][0]
