@@ -54,7 +54,7 @@ class Oracle:
         raw = np.c_[imu.vector("gyro"), imu.vector("accel")]
         offers = sorted(
             (float(t), rank, name, i)
-            for rank, name in enumerate(("gnss", "barometer", "magnetometer"))
+            for rank, name in enumerate(("gnss", "barometer", "magnetometer", "rotors"))
             if name in flight
             for i, t in enumerate(flight[name].t)
         )

@@ -414,7 +414,10 @@ class Estimator:
 
     def _offer_of_the_air(self, sensor: str, t: float, values: Sequence[float] | Mapping[str, float]) -> bool:
         if sensor == "rotors":
-            speeds = values.values() if isinstance(values, Mapping) else _flat(values, "values of rotors")
+            named = [v for k, v in values.items() if str(k).startswith("speed_")] if isinstance(values, Mapping) else None
+            if named == []:
+                raise UsageError("values of rotors by name (speed_0, speed_1, ...)", ", ".join(map(repr, values)), "Estimator.offer")
+            speeds = named or _flat(values, "values of rotors")
             total = sum(abs(_number(x, "a rotor's speed", "Estimator.offer")) for x in speeds)
             return self._queue(ROTORS, t, (total, math.nan, math.nan), _NAN) if math.isfinite(total) else self._refuse(sensor, "not finite")
         v = _in_order(sensor, values, {"airdata": 1, "wind": 2, "attitude": 4}[sensor])
