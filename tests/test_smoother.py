@@ -70,9 +70,7 @@ class Oracle:
                 assert not t or s.t == imu.t[rows[-1] + 1]  # a row at every sample
                 copy = est.state
                 optional = [copy.record[block][0] for block in OPTIONAL]
-                x.append(
-                    (copy.q_nb, np.r_[copy.vel_n, copy.pos_n, copy.gyro_bias_b, copy.accel_bias_b, *(copy.record[b][0] for b in OPTIONAL)])
-                )
+                x.append((copy.q_nb, np.r_[copy.vel_n, copy.pos_n, copy.gyro_bias_b, copy.accel_bias_b, *optional]))
                 t.append(copy.t)
                 P.append(copy.P)
                 rows.append(int(np.searchsorted(imu.t, copy.t)))
@@ -178,7 +176,9 @@ class Oracle:
 def test_it_is_the_dense_smoother_of_the_textbook(estimator: str) -> None:
     flight = part(demo_flight(3, 24.0), 2.0, 8.0)
     if estimator == "wind":
-        flight = part(simulate(Scenario(mission="figure-eight", duration=30.0, rest=0.0, seed=4, tell_noise=True, wind={"n": 4.0})), 8.0, 14.5)
+        flight = part(
+            simulate(Scenario(mission="figure-eight", duration=30.0, rest=0.0, seed=4, tell_noise=True, wind={"n": 4.0})), 8.0, 14.5
+        )
         flight, estimator = flight.without("truth", "power"), "navigator"
     prompt = {f"delay.{k}": 0.0 for k in ("gnss", "barometer", "magnetometer")}
     solution = run(flight, estimator, set=prompt, smooth=True)
