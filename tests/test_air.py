@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 import math
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -366,6 +367,17 @@ def test_a_step_of_the_wind_is_followed(seed: int) -> None:
 
 def scipy_many(q: FloatArray) -> Any:
     return Rotation.from_quat(q[:, [1, 2, 3, 0]])
+
+
+@pytest.mark.slow
+def test_the_stated_sigma_of_a_hover_is_honest() -> None:
+    """Steady wind, fixed heading; attitude, biases, drag from the filter's priors: 68 ± 5 % within 1 sigma, 95 ± 3 % within two."""
+    sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "docs"))
+    import _wind_flights
+
+    found = _wind_flights.honesty(1000)
+    assert abs(found["one"] - 0.68) < 0.05
+    assert abs(found["two"] - 0.95) < 0.03
 
 
 # recordings
