@@ -50,7 +50,7 @@ CONDITIONS = (
 FLIGHTS: list[tuple[str, str, float]] = [("gentle", "figure-eight", 0.5), ("aggressive", "lissajous", 1.0)]
 
 _TOLD = {"noise.gyro": GYRO, "noise.accel": ACCEL, "noise.airspeed": AIRSPEED}
-_GIVEN = {**_TOLD, "wind.n": WIND[0], "wind.e": WIND[1], "wind.sd": GUST}
+_GIVEN = {**_TOLD, "told_wind.n": WIND[0], "told_wind.e": WIND[1], "told_wind.sd": GUST}
 _OPEN = {"wind_attitude.force": 1e6, "wind_attitude.acceleration": 1e6}
 #: Columns of the comparison: title, preset, keys. Below three times its noise an airspeed has no direction (amendment 11).
 FILTERS: list[tuple[str, str, dict[str, Any]]] = [
@@ -177,11 +177,11 @@ def real(path: Path) -> dict[str, Any]:
     ours = haltere.run(flight, "wind-attitude", scored=False)
     inside = (ours.t > begins) & (ours.t < ends)
     n, e = (float(np.median(ours[c][inside])) for c in ("wind_n", "wind_e"))
-    given = {"wind.n": n, "wind.e": e}
+    given = {"told_wind.n": n, "told_wind.e": e}
     rows = []
     for name, preset, keys in (
         ("as-printed", "as-printed", given), ("as-printed, atan2", "as-printed", {**given, "wind_attitude.angles": "atan2"}),
-        ("as-corrected", "as-corrected", given), ("as-corrected, told of no wind", "as-corrected", {"wind.n": 0.0, "wind.e": 0.0}),
+        ("as-corrected", "as-corrected", given), ("as-corrected, told of no wind", "as-corrected", {"told_wind.n": 0.0, "told_wind.e": 0.0}),
         ("as-corrected, no wind rows", "as-corrected", {"aid.airdata": "off"}), ("default", "default", {}),
     ):  # fmt: skip
         series = error_series(haltere.run(flight, "wind-attitude", preset=preset, set=keys, scored=False), flight["onboard"])

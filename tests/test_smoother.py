@@ -104,12 +104,12 @@ class Oracle:
         Q[:6] = list(np.array(Q[:6]) + missed * np.r_[gyro_step**2, np.full(3, force_step @ force_step / 3.0)])
         Q += [self.number("noise.baro_bias") ** 2 * h] * min(n - 15, 1)
         if n > 16:  # wind as its force at hover, ln mu, ln c, two offsets, the mean of the force
-            keep = np.exp(-h / self.number("wind.gust_time"))
+            keep = np.exp(-h / self.number("air.gust_time"))
             F[16:18, 16:18], F[16:18, 22:24] = keep * np.eye(2), (1.0 - keep) * np.eye(2)
             new[13:15] = keep * v[13:15] + (1.0 - keep) * v[19:21]
             mu, c, mean = np.exp(v[15]), np.exp(v[16]), np.hypot(*v[19:21])
             per_wind = np.sqrt(mu * mu + 4.0 * c * mean)
-            gust = per_wind * (self.number("wind.gust") + self.number("wind.turbulence") * (per_wind - mu) / (2.0 * c))
+            gust = per_wind * (self.number("air.gust") + self.number("air.turbulence") * (per_wind - mu) / (2.0 * c))
             Q += [gust**2 * (1.0 - keep**2)] * 2 + [self.number("noise.air_walk") ** 2 * h] * 4
             Q += [(per_wind * self.number("noise.wind_mean")) ** 2 * h] * 2
         return R * Rotation.from_rotvec(turn), new, F, F @ self.P[k] @ F.T + np.diag(Q)

@@ -44,7 +44,7 @@ import _wind_attitude  # noqa: E402
 
 FloatArray = NDArray[np.float64]
 DEG = math.pi / 180.0
-WIND = {"wind.n": 4.0, "wind.e": 2.0, "wind.sd": 0.8}
+WIND = {"told_wind.n": 4.0, "told_wind.e": 2.0, "told_wind.sd": 0.8}
 PRESETS = ("as-corrected", "as-printed")
 law = settings(deadline=None, max_examples=60)  # the first example may compile
 unit = st.tuples(*(st.floats(-1.0, 1.0) for _ in range(4))).filter(lambda q: sum(x * x for x in q) > 0.05)
@@ -364,7 +364,7 @@ def test_vanes_that_say_nothing() -> None:
 def test_station(direction: float, n: float, e: float) -> None:
     """A station says where the wind comes from; here it is where it blows to."""
     np.testing.assert_allclose(station_wind(5.0, direction * DEG), (n, e), atol=1e-4)
-    keys = {"wind.speed": 5.0, "wind.from": direction * DEG}
+    keys = {"told_wind.speed": 5.0, "told_wind.from": direction * DEG}
     np.testing.assert_allclose(steady_wind(config.resolve("wind-attitude", "as-printed", keys).values), (n, e, 0.0), atol=1e-4)
 
 
@@ -561,7 +561,7 @@ def test_without_streams(flight: FlightLog) -> None:
     assert "no velocity from GNSS" in words
     sensors, words = told(flight, {})
     assert sensors == {"accelerometer", "magnetometer"}
-    assert "no wind (keys wind.n" in words
+    assert "no wind (keys told_wind.n" in words
     bare = flight.streams | {"airdata": Stream({k: v for k, v in flight["airdata"].columns.items() if k in ("t", "airspeed")})}
     sensors, words = told(FlightLog(bare, flight.meta).without("rotors"), WIND)
     assert sensors == {"accelerometer", "magnetometer"}
@@ -606,10 +606,14 @@ def test_gaps(flight: FlightLog) -> None:
 @pytest.mark.parametrize(
     ("preset", "keys", "says"),
     [
-        ("as-corrected", {"wind.n": 3.0}, "wind.n with wind.e"),
-        ("as-corrected", {"wind.speed": 3.0}, "wind.speed with wind.from"),
-        ("as-corrected", {"wind.n": 3.0, "wind.e": 1.0, "wind.speed": 3.0, "wind.from": 1.0}, "a wind is given whole, and once"),
-        ("default", {"wind.n": 3.0, "wind.e": 1.0}, "a key that wind-attitude has"),
+        ("as-corrected", {"told_wind.n": 3.0}, "told_wind.n with told_wind.e"),
+        ("as-corrected", {"told_wind.speed": 3.0}, "told_wind.speed with told_wind.from"),
+        (
+            "as-corrected",
+            {"told_wind.n": 3.0, "told_wind.e": 1.0, "told_wind.speed": 3.0, "told_wind.from": 1.0},
+            "a wind is given whole, and once",
+        ),
+        ("default", {"told_wind.n": 3.0, "told_wind.e": 1.0}, "a key that wind-attitude has"),
         ("as-corrected", {"aid.airdata": "auto"}, "aid.airdata of wind-attitude to be off or on"),
         ("as-corrected", {"wind_attitude.integrator": "picard5"}, "did you mean 'picard4'"),
         ("as-corrected", {"wind_attitude.filter": "error-state"}, "a key that wind-attitude has"),
@@ -660,7 +664,7 @@ def test_command_line_and_report(flight: FlightLog, tmp_path: Path, monkeypatch:
     """`haltere run --estimator wind-attitude --preset as-corrected` leaves its files; the report draws the three observations."""
     folder = write_folder(flight, tmp_path / "flight")
     words = ["haltere", "run", str(folder), "--estimator", "wind-attitude", "--preset", "as-corrected", "--out", str(tmp_path / "out")]
-    words += ["--set", "wind.speed=4.47", "--set", "wind.from=3.605", "--set", "wind_attitude.integrator=rk4"]
+    words += ["--set", "told_wind.speed=4.47", "--set", "told_wind.from=3.605", "--set", "wind_attitude.integrator=rk4"]
     monkeypatch.setattr(sys, "argv", words)
     with pytest.raises(SystemExit) as left:
         cli.main()

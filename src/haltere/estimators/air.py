@@ -150,21 +150,26 @@ def station_wind(speed: Any, direction_from: Any) -> tuple[Any, Any]:
 
 
 def steady_wind(values: Mapping[str, Any]) -> tuple[float, float, float] | None:
-    """Provider (c), constant: wind of the keys ``wind.*`` [m/s], where it blows to, or None where none is given.
+    """Provider (c), constant: wind of the keys ``told_wind.*`` [m/s], where it blows to, or None where none is given.
 
     Raises
     ------
     UsageError
         Half of one, or a wind given twice.
     """
-    n, e, speed, towards = (float(values[f"wind.{k}"]) for k in ("n", "e", "speed", "from"))
+    n, e, speed, towards = (float(values[f"told_wind.{k}"]) for k in ("n", "e", "speed", "from"))
     vector, station = [not math.isnan(x) for x in (n, e)], [not math.isnan(x) for x in (speed, towards)]
     if any(vector) != all(vector) or any(station) != all(station) or (any(vector) and any(station)):
-        given = ", ".join(f"wind.{k}" for k in ("n", "e", "speed", "from") if not math.isnan(float(values[f"wind.{k}"])))
-        raise UsageError("wind.n with wind.e, or wind.speed with wind.from", given, "configuration", "a wind is given whole, and once")
+        given = ", ".join(f"told_wind.{k}" for k in ("n", "e", "speed", "from") if not math.isnan(float(values[f"told_wind.{k}"])))
+        raise UsageError(
+            "told_wind.n with told_wind.e, or told_wind.speed with told_wind.from",
+            given,
+            "configuration",
+            "a wind is given whole, and once",
+        )
     if any(station):
         n, e = (float(x) for x in station_wind(speed, towards))
-    return (n, e, float(values["wind.d"])) if any(vector) or any(station) else None
+    return (n, e, float(values["told_wind.d"])) if any(vector) or any(station) else None
 
 
 def given_wind(stream: Stream | None, config: Config) -> GivenWind | None:

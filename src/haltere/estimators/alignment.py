@@ -203,7 +203,7 @@ def start_air(s: Any, prm: Any, o: int) -> None:
         P[k, k] = sd * sd
         scale = prm.drag_mu
     for i in range(len(s.wind)):
-        gust = scale * prm.wind_gust
+        gust = scale * prm.air_gust
         s.wind[i] = 0.0
         P[o + i, o + i] = gust * gust if i < 2 else 0.25 * gust * gust
     for i in range(len(s.steady)):  # all that is known of the wind before any is felt is known of its mean

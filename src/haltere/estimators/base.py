@@ -168,7 +168,7 @@ def _published(record: NDArray[np.void], config: Config) -> None:
     record["t_gnss"] = record["air"]["t_rotors"] = -1e9
     wind = steady_wind(config.values)
     if wind is not None:
-        record["wind_v"][0], record["wind_r"], record["has_wind"] = wind, config.number("wind.sd") ** 2, 1
+        record["wind_v"][0], record["wind_r"], record["has_wind"] = wind, config.number("told_wind.sd") ** 2, 1
     elif config["wind_attitude.rows"] == "printed":  # which have no wind in them
         record["has_wind"] = 1
 

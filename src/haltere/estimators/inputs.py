@@ -258,7 +258,7 @@ def _wind_triangle(checked: Checked, config: Config) -> list[Part]:
     if config["wind_attitude.air"] != "off":
         lacks = [] if checked.streams.get("gnss") is not None and config["aid.gnss"] == "on" else ["velocity from GNSS"]
         if wind is None and steady_wind(config.values) is None and config["wind_attitude.rows"] == "jacobian":
-            lacks.append("wind (keys wind.n and wind.e or wind.speed and wind.from, or a stream wind)")
+            lacks.append("wind (keys told_wind.n and told_wind.e or told_wind.speed and told_wind.from, or a stream wind)")
         if lacks:
             told.append(f"wind triangle: no {' and no '.join(lacks)}; attitude is that of gravity and field alone")
     if config["wind_attitude.angles"] == "arctan":

@@ -117,16 +117,18 @@ KEYS: dict[str, Key] = {
         "m/s",
         "Fake velocity of ahrs, 1 sigma at 5 Hz: worth 2 m/s that last a second. Lower trusts gravity more, accelerations less.",
     ),
-    "wind.n": Key(math.nan, "m/s", "Wind taken for true, where it blows to, north. Default: not given.", low=-100.0, high=100.0),
-    "wind.e": Key(math.nan, "m/s", "The same, east.", low=-100.0, high=100.0),
-    "wind.d": Key(0.0, "m/s", "The same, down.", low=-50.0, high=50.0),
-    "wind.speed": Key(math.nan, "m/s", "Instead of wind.n and wind.e, as a station gives it: its speed,", low=0.0, high=100.0),
-    "wind.from": Key(math.nan, "rad", "and where it comes from, clockwise from true north.", low=-6.2832, high=6.2832),
-    "wind.sd": _positive(1.0, "m/s", "1 sigma of each of its components, gusts included."),
+    "told_wind.n": Key(math.nan, "m/s", "Wind taken for true, where it blows to, north. Default: not given.", low=-100.0, high=100.0),
+    "told_wind.e": Key(math.nan, "m/s", "The same, east.", low=-100.0, high=100.0),
+    "told_wind.d": Key(0.0, "m/s", "The same, down.", low=-50.0, high=50.0),
+    "told_wind.speed": Key(
+        math.nan, "m/s", "Instead of told_wind.n and told_wind.e, as a station gives it: its speed,", low=0.0, high=100.0
+    ),
+    "told_wind.from": Key(math.nan, "rad", "and where it comes from, clockwise from true north.", low=-6.2832, high=6.2832),
+    "told_wind.sd": _positive(1.0, "m/s", "1 sigma of each of its components, gusts included."),
     "noise.wind_mean": _positive(0.05, "m/s/sqrt(s)", "Walk of the mean wind, which gusts return to."),
-    "wind.gust": _positive(0.3, "m/s", "Gusts, 1 sigma an axis in calm air; vertical ones are half of it."),
-    "wind.turbulence": Key(0.15, "1", "Gusts more in proportion to the mean wind.", low=0.0, high=2.0),
-    "wind.gust_time": _positive(3.0, "s", "How long a gust lasts."),
+    "air.gust": _positive(0.3, "m/s", "Gusts, 1 sigma an axis in calm air; vertical ones are half of it."),
+    "air.turbulence": Key(0.15, "1", "Gusts more in proportion to the mean wind.", low=0.0, high=2.0),
+    "air.gust_time": _positive(3.0, "s", "How long a gust lasts."),
     "noise.air_walk": _positive(
         2e-3, "1/sqrt(s)", "Walk of what air data depend on: relative for drag and airspeed scale, in m/s^2 and rad for offsets."
     ),
@@ -365,7 +367,7 @@ GROUPS: dict[str, tuple[str, ...]] = {
 _TWO_STAGE = tuple(key for key in KEYS if key.startswith("two_stage."))
 _WIND_ATTITUDE = tuple(key for key in KEYS if key.startswith("wind_attitude."))
 #: A wind taken for true, which only the published filter of wind-attitude needs.
-_GIVEN_WIND = tuple(f"wind.{key}" for key in ("n", "e", "d", "speed", "from", "sd"))
+_GIVEN_WIND = tuple(f"told_wind.{key}" for key in ("n", "e", "d", "speed", "from", "sd"))
 #: What only an estimator with wind has.
 _AIR_TAILS = (
     "wind wind_mean air_walk airspeed aoa sideslip airdata_time no_sideslip drag drag_time given_wind air airdata vanes airspeed_scale vane"
@@ -373,7 +375,7 @@ _AIR_TAILS = (
 _AIR = tuple(
     key
     for key in KEYS
-    if not key.startswith("delay.") and (key.startswith(("air.", "drag.", "wind.")) or key.partition(".")[2] in _AIR_TAILS)
+    if not key.startswith("delay.") and (key.startswith(("air.", "drag.", "told_wind.")) or key.partition(".")[2] in _AIR_TAILS)
 )
 _NO_AIR: dict[str, Value] = {"aid.drag": "off", "aid.airdata": "off", "aid.vanes": "off", "aid.no_sideslip": "off", "aid.wind": "off"}
 #: What an estimator sets differently from the defaults above.
@@ -397,7 +399,7 @@ _PRESET_OVERRIDES: dict[tuple[str, str], dict[str, Value]] = {
     ("two-stage", "as-corrected"): {
         "two_stage.tolerance": 0.03, "two_stage.innovation": "off", "two_stage.radial": math.nan,
         "two_stage.memory": 0.0, "two_stage.haversine": "on",
-        "gate.gnss": _NO_GATE, "gate.magnetometer": _NO_GATE, "noise.field": 0.0, "noise.gyro_scale": 0.0,
+        "gate.gnss": _NO_GATE, "gate.magnetometer": _NO_GATE, "noise.field": 0.0, "noise.gyro_scale": 0.0, "noise.between": 0.0,
     },
 }  # fmt: skip
 _PRESET_OVERRIDES["two-stage", "as-printed"] = _PRESET_OVERRIDES["two-stage", "as-corrected"] | {

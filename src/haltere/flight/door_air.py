@@ -33,7 +33,9 @@ def _airdata(out: Any, stream: Stream) -> Stream:
     known = np.isfinite(stream.get("airspeed")) | np.isfinite(stream.get("aoa") + stream.get("sideslip"))
     stream = out.drop("airdata", stream, np.asarray(known), "not finite")
     airspeed = stream.get("airspeed")
-    stream = out.drop("airdata", stream, np.asarray(~((airspeed < 0.0) | (airspeed > AIRSPEED_MAX))), "airspeed impossible in m/s")
+    stream = out.drop(
+        "airdata", stream, np.asarray(~((airspeed < -AIRSPEED_MAX) | (airspeed > AIRSPEED_MAX))), "airspeed impossible in m/s"
+    )
     # a vehicle that flies backwards, or is blown there, has angles of attack up to a half turn; asin gives sideslip a quarter
     for name, most in (("aoa", 3.2), ("sideslip", 1.6)):
         found = np.abs(stream.get(name))

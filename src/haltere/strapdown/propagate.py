@@ -217,7 +217,7 @@ def unseen(s: Any, prm: Any, w0: Vec, f0: Vec, w1: Vec, f1: Vec, dt: float) -> N
 @jit
 def gust_keeps(prm: Any, dt: float) -> float:
     """What is left of a gust after ``dt`` seconds."""
-    return math.exp(-dt / prm.wind_gust_time)
+    return math.exp(-dt / prm.air_gust_time)
 
 
 @jit
@@ -237,7 +237,7 @@ def blow(s: Any, prm: Any, o: int, dt: float) -> None:
         mu, c = math.exp(s.drag[0]), math.exp(s.drag[1])
         factor = math.sqrt(mu * mu + 4.0 * c * speed)  # µ + 2c|W|
         speed = 2.0 * speed / (mu + factor)
-    gust, walk = factor * (prm.wind_gust + prm.wind_turbulence * speed), factor * prm.noise_wind_mean
+    gust, walk = factor * (prm.air_gust + prm.air_turbulence * speed), factor * prm.noise_wind_mean
     for i in range(len(s.wind)):
         if i < 2:
             s.wind[i] = keep * s.wind[i] + (1.0 - keep) * s.steady[i]
