@@ -74,12 +74,13 @@ if TYPE_CHECKING:
     from haltere.evaluate.compare import compare
     from haltere.flight.log import FlightLog, FlightMeta, Home, Stream
     from haltere.flight.solution import Solution
+    from haltere.identify.drag import identify_drag
     from haltere.readers import read
     from haltere.simulate import Scenario, inject, simulate
 
 __all__ = [
     "Estimator", "FlightLog", "FlightMeta", "HaltereError", "Home", "Scenario", "Solution", "Stream", "__version__",
-    "calibrate_magnetometer", "campaign", "compare", "inject", "read", "run", "simulate",
+    "calibrate_magnetometer", "campaign", "compare", "identify_drag", "inject", "read", "run", "simulate",
 ]  # fmt: skip
 
 # Where each public name lives: loaded at its first use, so that `import haltere` costs no numba, polars or scipy.
@@ -95,6 +96,7 @@ _HOME = {
     "calibrate_magnetometer": "haltere.calibrate.magnetometer",
     "campaign": "haltere.evaluate.campaign",
     "compare": "haltere.evaluate.compare",
+    "identify_drag": "haltere.identify.drag",
     "inject": "haltere.simulate",
     "read": "haltere.readers",
     "run": "haltere.drive",

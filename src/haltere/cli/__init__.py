@@ -197,6 +197,40 @@ def _calibrate_magnetometer(
 
 
 @app.command(
+    "identify",
+    short_help="The vehicle's drag from flights in wind.",
+    help="Identify a vehicle from its flights. --drag: the drag that PX4's and ArduPilot's wind estimation needs (EKF2_MCOEF, EKF2_BCOEF_X/Y, "
+    "EK3_DRAG_*) and haltere's own, jointly with the wind, with its uncertainty, ready to paste. Refused where the flights do not tell it.",
+)
+def _identify(
+    logs: Annotated[list[Path], typer.Argument(metavar="LOG...", help="Logs or flight folders of one vehicle.", show_default=False)],
+    drag: Annotated[bool, typer.Option("--drag", help="Drag and wind.")] = False,
+    config: Annotated[
+        Path | None, typer.Option("--config", metavar="F", help="Configuration file, as of a run.", show_default=False)
+    ] = None,
+    set_: Annotated[
+        list[str] | None,
+        typer.Option("--set", metavar="KEY=VALUE", help="One key, e.g. baro.temperature=293. May be repeated.", show_default=False),
+    ] = None,
+    out: Annotated[
+        Path | None, typer.Option("--out", metavar="DIR", help="Folder to write. Default: ./<log>.haltere", show_default=False)
+    ] = None,
+    columns: Columns = None,
+    column: Column = None,
+    json: Json = False,
+    open_: Open = False,
+) -> None:
+    from haltere.cli.identify import drag as identify_drag
+    from haltere.errors import UsageError
+
+    if not drag:
+        raise UsageError("what to identify: --drag", "nothing", "identify")
+    identify_drag(
+        logs, config=config, assignments=set_ or [], out=out, columns=columns, column=column, json=json, show=open_
+    )
+
+
+@app.command(
     "simulate",
     short_help="A simulated flight with truth.",
     help="Simulate a flight and write it as a flight folder with truth. SCENARIO is a built-in name (hover, climb, box, figure-eight, "
