@@ -170,7 +170,7 @@ def _loop(
 
     The last of what comes back is the tape for smoothing, empty where none is wanted.
     """
-    width = int(kernels.row_width(S["baro"].shape[1], S["mag"].shape[1]))
+    width = int(kernels.row_width(S["P"].shape[1]))
     columns = np.empty((width, len(t)))
     chunk = np.empty((CHUNK + 4 * IMU_CAPACITY, width))
     aids = as_records(np.empty(AID_ROOM, AID_RECORD))
@@ -178,7 +178,7 @@ def _loop(
     events: list[dict[str, Any]] = []
     # room for all nodes of most flights, so that nothing need be copied: a node a measurement, some a second beside; more makes more tapes
     room = len(m.t) + int(60.0 * (t[-1] - t[0])) + 8 * IMU_CAPACITY if smooth else 0
-    tape = np.empty((room, node_width(S["P"].shape[1], S["baro"].shape[1])))
+    tape = np.empty((room, node_width(S["P"].shape[1])))
     tapes: list[FloatArray] = []
     filled = 0
 
@@ -256,7 +256,6 @@ def _event(kind: str, sensor: str, record: np.void, bank: bool) -> dict[str, Any
 
 def _table(rows: FloatArray, S: NDArray[np.void], position: bool) -> dict[str, FloatArray]:
     """Columns of the solution from the raw output rows; variances become standard deviations in place."""
-    baro = S["baro"].shape[1]
     out = {"t": rows[0]} | {f"q_{a}": rows[1 + k] for k, a in enumerate("wxyz")}
     sd_roll, sd_pitch, sd_yaw = _euler_sd(rows[1:5], rows[17:23])
     np.sqrt(rows[23:35], out=rows[23:35])
@@ -266,10 +265,10 @@ def _table(rows: FloatArray, S: NDArray[np.void], position: bool) -> dict[str, F
         if S["has_origin"][0]:
             out["lat"], out["lon"], out["alt"] = geodetic_from_local(rows[8], rows[9], rows[10], *(float(x) for x in S["origin"][0]))
     out |= {f"gyro_bias_{a}": rows[11 + k] for k, a in enumerate("xyz")}
+    values, deviations = _optional(rows, S)
     if position:
         out |= {f"accel_bias_{a}": rows[14 + k] for k, a in enumerate("xyz")}
-        if baro:
-            out["baro_bias"] = rows[35]
+        out |= values
     out |= {"sd_roll": sd_roll, "sd_pitch": sd_pitch, "sd_yaw": sd_yaw}
     if position:
         out |= {f"sd_vel_{a}": rows[23 + k] for k, a in enumerate("ned")}
@@ -277,14 +276,38 @@ def _table(rows: FloatArray, S: NDArray[np.void], position: bool) -> dict[str, F
     out |= {f"sd_gyro_bias_{a}": rows[29 + k] for k, a in enumerate("xyz")}
     if position:
         out |= {f"sd_accel_bias_{a}": rows[32 + k] for k, a in enumerate("xyz")}
-        if baro:
-            np.sqrt(rows[36], out=rows[36])
-            out["sd_baro_bias"] = rows[36]
-    if S["mag"].shape[1]:
-        k = 35 + 2 * baro
-        out |= {f"mag_offset_{a}": rows[k + i] for i, a in enumerate("xyz")}
-        out |= {f"sd_mag_offset_{a}": np.sqrt(rows[k + 3 + i]) for i, a in enumerate("xyz")}
+        out |= deviations
     return out
+
+
+#: Columns of the optional states in the order of `haltere.strapdown.optional`; those in `_LOGARITHMIC` are states as logarithms,
+#: those without a name are not given out.
+_OPTIONAL = {
+    "baro": ("baro_bias",),
+    "mag": ("mag_offset_x", "mag_offset_y", "mag_offset_z"),
+    "wind": ("wind_n", "wind_e", "wind_d"),
+    "drag": ("drag_mu", "drag_c", "drag_offset_x", "drag_offset_y"),
+    "steady": ("", ""),
+    "vane": ("airspeed_scale", "aoa_offset", "sideslip_offset"),
+}
+_LOGARITHMIC = ("drag_mu", "drag_c", "airspeed_scale")
+
+
+def _optional(rows: FloatArray, S: NDArray[np.void]) -> tuple[dict[str, FloatArray], dict[str, FloatArray]]:
+    """Columns of the optional states, and of their standard deviations, from the raw output rows."""
+    names = [name for block, columns in _OPTIONAL.items() for name in columns[: S[block].shape[1]]]
+    values: dict[str, FloatArray] = {}
+    deviations: dict[str, FloatArray] = {}
+    for i, name in enumerate(names):
+        if not name:  # kept inside
+            continue
+        value, sd = rows[35 + i], rows[35 + len(names) + i]
+        np.sqrt(np.maximum(sd, 0.0, out=sd), out=sd)
+        if name in _LOGARITHMIC:
+            np.exp(value, out=value)
+            sd *= value
+        values[name], deviations[f"sd_{name}"] = value, sd
+    return values, deviations
 
 
 def _euler_sd(q: FloatArray, P: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
@@ -337,6 +360,12 @@ def _covariance(cov: FloatArray, n: int) -> dict[str, FloatArray]:
         out[name] = np.ascontiguousarray(cov[1 + 6 * b : 7 + 6 * b, :n].T[:, where])
     if np.isfinite(cov[31, :n]).any():
         out["baro_bias"] = np.ascontiguousarray(cov[31, :n].reshape(-1, 1, 1))
+    if np.isfinite(cov[32, :n]).any():
+        wind = cov[32:38, :n].T[:, where]
+        out["wind"] = np.ascontiguousarray(wind if np.isfinite(cov[37, :n]).any() else wind[:, :2, :2])
+    if np.isfinite(cov[32, :n]).any():
+        wind = cov[32:38, :n].T[:, where]
+        out["wind"] = np.ascontiguousarray(wind if np.isfinite(cov[37, :n]).any() else wind[:, :2, :2])
     return out
 
 

@@ -6,8 +6,11 @@ from typing import Any
 
 from haltere._jit import jit
 from haltere.aids import (
+    airspeed,
+    attitude,
     barometer,
     compass,
+    drag,
     fake,
     first_stage,
     gnss,
@@ -15,28 +18,38 @@ from haltere.aids import (
     magnetometer,
     orthonormal_field,
     rest,
+    vanes,
+    wind,
     zero_rate,
     zero_velocity,
 )
+from haltere.aids.air import SILENT, AirOffer
 from haltere.aids.fusing import NOTHING, Offer, fuse_offer
 from haltere.aids.record import (
+    AIRSPEED,
+    ATTITUDE,
     BAROMETER,
+    DRAG,
     FAKE_POSITION,
     FAKE_VELOCITY,
     GNSS_POSITION,
     GNSS_VELOCITY,
     MAGNETOMETER,
     N_QUEUED,
+    NO_SIDESLIP,
     POWER,
+    ROTORS,
+    VANES,
+    WIND,
     ZERO_RATE,
     ZERO_VELOCITY,
 )
 from haltere.core.rotation import Vec
 from haltere.filter.queue import pop_due
 
-__all__ = ["N_SENSORS", "due", "fuse_all", "offer_of"]
+__all__ = ["N_SENSORS", "air_offer_of", "due", "fuse_all", "offer_of"]
 
-N_SENSORS = 9
+N_SENSORS = 16
 
 
 @jit
@@ -55,6 +68,11 @@ def offer_of(s: Any, prm: Any, sensor: int, m: Any, aids: Any, dt: float, w: Vec
     if sensor == POWER:
         interference.hear(s, m.t, m.z[0])
         return NOTHING
+    if sensor == ROTORS:
+        drag.hear(s, m.t, m.z[0])
+        return NOTHING
+    if sensor == ATTITUDE:
+        return attitude.offer(s, prm, m)
     if sensor == ZERO_VELOCITY:
         return zero_velocity.offer(s, prm)
     if sensor == ZERO_RATE:
@@ -67,16 +85,48 @@ def offer_of(s: Any, prm: Any, sensor: int, m: Any, aids: Any, dt: float, w: Vec
 
 
 @jit
+def air_offer_of(s: Any, prm: Any, sensor: int, m: Any) -> AirOffer:
+    """The same of the sensors of the air, whose rows are wider."""
+    if sensor == AIRSPEED:
+        return airspeed.offer(s, prm, m)
+    if sensor == VANES:
+        return vanes.offer(s, prm, m)
+    if sensor == WIND:
+        return wind.offer(s, prm, m)
+    if sensor == DRAG:
+        return drag.offer(s, prm)
+    if sensor == NO_SIDESLIP:
+        return vanes.offer_no_sideslip(s, prm)
+    return SILENT
+
+
+@jit
+def of_the_air(sensor: int) -> bool:
+    """Whether `air_offer_of` speaks for a sensor."""
+    return sensor in (AIRSPEED, VANES, WIND, DRAG, NO_SIDESLIP)
+
+
+@jit
 def due(s: Any, prm: Any, sensor: int, w: Vec, f: Vec) -> bool:
     """Is this pseudo-measurement to be made now? Its clock (10 Hz at rest, 5 Hz fake), its switch, its conditions."""
     a = s.aid[sensor]
     if s.t < a.t_due:
         return False
-    a.t_due = s.t + (0.1 if sensor in (ZERO_VELOCITY, ZERO_RATE) else 0.2) - 1e-6
+    a.t_due = s.t + (0.1 if sensor in (ZERO_VELOCITY, ZERO_RATE, DRAG) else 0.2) - 1e-6
     if sensor == ZERO_VELOCITY:
         return prm.aid_zero_velocity > 0.0 and rest.at_rest(s, prm, w, f)
     if sensor == ZERO_RATE:
         return prm.aid_zero_rate > 0.0 and rest.at_rest(s, prm, w, f)
+    if sensor == DRAG:
+        if len(s.drag) == 0:
+            a.t_due = 1e18
+            return False
+        return drag.airborne(s, prm, w, f)
+    if sensor == NO_SIDESLIP:
+        if not (prm.aid_no_sideslip == 1.0 and len(s.wind) > 0):
+            a.t_due = 1e18
+            return False
+        return True
     if sensor == FAKE_VELOCITY:
         return prm.aid_fake_velocity > 0.0
     if fake.position_is_lost(s):
@@ -105,6 +155,11 @@ def fuse_all(s: Any, prm: Any, aids: Any, dt: float, w: Vec, f: Vec, first: int,
         if i >= 0:
             m = s.ring[sensor if sensor < N_QUEUED else 0, i]
             resting = s.rest.still == 1 and s.rest.moved == 0
+            if of_the_air(sensor):
+                fuse_offer(s, aids, t, sensor, air_offer_of(s, prm, sensor, m))
+                if sensor >= N_QUEUED:
+                    sensor += 1
+                continue
             offer = offer_of(s, prm, sensor, m, aids, dt, w, resting, stage)
             yaw, bias = s.yaw_corrected, 0.0
             if sensor == MAGNETOMETER:

@@ -33,6 +33,7 @@ __all__ = [
     "NO_GATE",
     "NO_TIMEOUT",
     "NO_TURN",
+    "ONLY_AIR",
     "ONLY_TURN",
     "Offer",
     "Robust",
@@ -50,8 +51,8 @@ Offer = tuple[int, int, Vec, Vec, Vec, tuple[Row, Row, Row], float, float, int, 
 #: and how many successive samples share one error (1: none): a factor on r that no test sees.
 Robust = tuple[int, float, float, float]
 
-#: The gain as it is, only its turn about the vertical, or all but that.
-ANY_TURN, ONLY_TURN, NO_TURN = (constant(i) for i in (0, 1, 2))
+#: The gain as it is, only its turn about the vertical, all but that, or only what it does to wind and what air data depend on.
+ANY_TURN, ONLY_TURN, NO_TURN, ONLY_AIR = (constant(i) for i in (0, 1, 2, 3))
 
 #: No robust weight: all up to the gate.
 HARD = (PLAIN, 1e9, 1.0, 1.0)
@@ -114,7 +115,7 @@ def judge(s: Any, sensor: int, t: float, ratio: float, timeout: float, reason: i
 
 
 @jit
-def fuse_offer(s: Any, aids: Any, t: float, sensor: int, offer: Offer) -> None:
+def fuse_offer(s: Any, aids: Any, t: float, sensor: int, offer: Any) -> None:
     """Test the components of an offer together (NIS/gate²), fuse them one after the other, and record them.
 
     Parameters
@@ -126,7 +127,7 @@ def fuse_offer(s: Any, aids: Any, t: float, sensor: int, offer: Offer) -> None:
     sensor
         Code.
     offer
-        What the aid has to say, see `Offer`.
+        What the aid has to say, see `Offer`; rows may have any number of blocks.
     """
     n, component, z, h, r, H, gate, timeout, reason, turn, robust = offer
     form, soft, weighed, shared = robust
@@ -162,7 +163,10 @@ def fuse_offer(s: Any, aids: Any, t: float, sensor: int, offer: Offer) -> None:
                 row, r_i, e_i, ok = H2, r[2], e[2], ok2
             if ok:
                 optimal_gain(s, row, r_i)
-                if turn != ANY_TURN:
+                if turn == ONLY_AIR:
+                    for k in range(15 + len(s.baro) + len(s.mag)):
+                        s.k[k] = 0.0
+                elif turn != ANY_TURN:
                     project_gain(s, turn == ONLY_TURN)
                 apply(s, row, r_i, innovation(s, row, e_i))
         inject(s)

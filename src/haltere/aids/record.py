@@ -11,40 +11,28 @@ from haltere._jit import constant, jit
 
 __all__ = ["AID_RECORD", "COMPONENTS", "EVENTS", "REASONS", "SENSORS", "STATUSES", "event", "event_since", "record"]
 
-#: Sensor codes, and indices of the filter's memory of each sensor. The first five arrive from outside and are queued; the last
-#: is the bank of yaw hypotheses, which speaks of GNSS velocity.
-GNSS_VELOCITY, GNSS_POSITION, BAROMETER, MAGNETOMETER, POWER, ZERO_VELOCITY, ZERO_RATE, FAKE_POSITION, FAKE_VELOCITY, YAW_BANK = (
-    constant(i) for i in range(10)
-)
-N_QUEUED = 5
+#: Sensor codes, and indices of the filter's memory of each sensor. The first ones arrive from outside and are queued, the next are made
+#: by the filter itself, of what is measured and then (from `FAKE_POSITION` on) of what is assumed; the last is the bank of yaw
+#: hypotheses, which speaks of GNSS velocity.
+GNSS_VELOCITY, GNSS_POSITION, BAROMETER, MAGNETOMETER, POWER, ROTORS, AIRSPEED, VANES, WIND, ATTITUDE = (constant(i) for i in range(10))
+ZERO_VELOCITY, ZERO_RATE, DRAG, NO_SIDESLIP, FAKE_POSITION, FAKE_VELOCITY, YAW_BANK = (constant(i) for i in range(10, 17))
+N_QUEUED = 10
 #: Sensor of an event that no sensor made.
 NO_SENSOR = constant(0)
 #: Detail of an event that has none.
 NO_DETAIL = constant(0)
 SENSORS = (
-    "gnss", "gnss", "barometer", "magnetometer", "power", "zero_velocity", "zero_rate", "fake_position", "fake_velocity", "gnss",
+    "gnss", "gnss", "barometer", "magnetometer", "power", "rotors", "airdata", "airdata", "wind", "attitude",
+    "zero_velocity", "zero_rate", "drag", "no_sideslip", "fake_position", "fake_velocity", "gnss",
 )  # fmt: skip
 
 COMPONENTS = (
-    "vel_n",
-    "vel_e",
-    "vel_d",
-    "pos_n",
-    "pos_e",
-    "pos_d",
-    "altitude",
-    "heading",
-    "mag_x",
-    "mag_y",
-    "mag_z",
-    "rate_x",
-    "rate_y",
-    "rate_z",
-    "field_east",
-    "field_down",
-    "field_north",
-)
+    "vel_n", "vel_e", "vel_d", "pos_n", "pos_e", "pos_d", "altitude", "heading", "mag_x", "mag_y", "mag_z", "rate_x", "rate_y", "rate_z",
+    "field_east", "field_down", "field_north", "airspeed", "aoa", "sideslip", "drag_x", "drag_y", "wind_n", "wind_e", "wind_d",
+    "attitude_x", "attitude_y", "attitude_z",
+)  # fmt: skip
 C_VEL, C_POS, C_ALTITUDE, C_HEADING, C_MAG, C_RATE, C_FIELD = (constant(i) for i in (0, 3, 6, 7, 8, 11, 14))
+C_AIRSPEED, C_AOA, C_SIDESLIP, C_DRAG, C_WIND, C_ATTITUDE = (constant(i) for i in (17, 18, 19, 20, 22, 25))
 
 STATUSES = ("fused", "deweighted", "rejected", "held")
 FUSED, DEWEIGHTED, REJECTED, HELD = (constant(i) for i in range(4))

@@ -6,10 +6,15 @@ import math
 
 from haltere._jit import entry, jit
 
-__all__ = ["STANDARD_GRAVITY", "geodetic_from_local", "gravity", "local_from_geodetic", "local_from_sphere", "pressure_altitude", "radii"]
+__all__ = [
+    "STANDARD_DENSITY", "STANDARD_GRAVITY", "density", "geodetic_from_local", "gravity", "local_from_geodetic", "local_from_sphere",
+    "pressure_altitude", "radii",
+]  # fmt: skip
 
 #: Gravity [m/s^2] where no position is known.
 STANDARD_GRAVITY = 9.80665
+#: Density of the standard atmosphere at sea level [kg/m^3].
+STANDARD_DENSITY = 1.225
 #: WGS-84 semi-major axis [m] and first eccentricity squared.
 A_WGS84 = 6378137.0
 E2_WGS84 = 6.69437999014e-3
@@ -75,3 +80,9 @@ def geodetic_from_local(north: float, east: float, down: float, lat0: float, lon
 def pressure_altitude(pressure: float) -> float:
     """Altitude [m] of a pressure [Pa] in the standard atmosphere (theory-amendments.md §8)."""
     return 44330.77 * (1.0 - (pressure / 101325.0) ** 0.190263)
+
+
+@jit
+def density(alt: float) -> float:
+    """Density [kg/m^3] of the standard atmosphere at an altitude [m], in the troposphere."""
+    return STANDARD_DENSITY * max(1.0 - 2.25577e-5 * alt, 0.1) ** 4.25588

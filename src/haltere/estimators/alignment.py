@@ -10,11 +10,12 @@ import math
 from typing import Any
 
 from haltere._jit import constant, jit
-from haltere.aids import compass, first_stage, interference, rest
+from haltere.aids import compass, drag, first_stage, interference, rest
 from haltere.aids.fusing import DISTRUSTED, RUNNING
 from haltere.aids.gnss import position_observation, position_variance, velocity_variance
 from haltere.aids.magnetometer import learn_field
 from haltere.aids.record import (
+    ATTITUDE,
     BAROMETER,
     E_ALIGNED,
     E_REALIGNED,
@@ -24,6 +25,7 @@ from haltere.aids.record import (
     N_QUEUED,
     NO_SENSOR,
     POWER,
+    ROTORS,
     event,
 )
 from haltere.core.rotation import (
@@ -46,11 +48,13 @@ from haltere.core.rotation import (
 from haltere.estimators import yaw_bank
 from haltere.filter.queue import pop_due
 
-__all__ = ["AT_REST", "GRAVITY_ONLY", "IN_MOTION", "begin", "gather", "level_and_compass"]
+__all__ = ["AT_REST", "GIVEN", "GRAVITY_ONLY", "IN_MOTION", "begin", "gather", "level_and_compass"]
 
-AT_REST, IN_MOTION, GRAVITY_ONLY, TWO_SPANS = (constant(i) for i in (1, 2, 3, 4))
+AT_REST, IN_MOTION, GRAVITY_ONLY, TWO_SPANS, GIVEN = (constant(i) for i in (1, 2, 3, 4, 5))
 #: Longest wait [s] for a compass at rest, and for GNSS or rest before gravity alone must do.
 WAIT_COMPASS, WAIT_GRAVITY = 2.0, 5.0
+#: How long an attitude told from outside is that of now [s].
+WAIT_GIVEN = 0.3
 #: Without a compass an acceleration turns into tilt with the unknown yaw: wait for one below this [m/s^2], but no longer than [s].
 GENTLE, WAIT_GENTLE = 2.0, 20.0
 #: Two spans whose specific forces differ in direction (sine) give yaw too, when they are no further apart than this [s].
@@ -77,6 +81,7 @@ def begin(s: Any, t: float) -> None:
     a = s.align
     s.t = t
     s.phase = 1
+    a.t_given = -1e9
     a.t_first, a.t_gnss_v, a.t_gnss_p, a.t_baro, a.n_baro, a.open = t, -1e9, -1e9, -1e9, 0.0, 0
     a.t_ref = -1e9
     a.q[0], a.q[1], a.q[2], a.q[3] = 1.0, 0.0, 0.0, 0.0
@@ -126,6 +131,11 @@ def take_due(s: Any, prm: Any) -> bool:
                 a.n_baro += 1.0
             elif kind == POWER:
                 interference.hear(s, m.t, m.z[0])
+            elif kind == ROTORS:
+                drag.hear(s, m.t, m.z[0])
+            elif kind == ATTITUDE:
+                a.given[0], a.given[1], a.given[2], a.given[3] = quat_from_rotvec((m.z[0], m.z[1], m.z[2]))
+                a.t_given = m.t
             elif kind == MAGNETOMETER:
                 mu = mat_vec(dcm((a.q[0], a.q[1], a.q[2], a.q[3])), (m.z[0], m.z[1], m.z[2]))
                 a.n_m += 1.0
@@ -183,6 +193,34 @@ def level_and_compass(s: Any, prm: Any, f_b: Vec, a_n: Vec, m_b: Vec, has_m: boo
 
 
 @jit
+def start_air(s: Any, prm: Any, o: int) -> None:
+    """No wind, as far as is known, and the coefficients as they are told; ``o`` is the wind's first error state."""
+    P, scale = s.P, 1.0
+    for i in range(len(s.drag)):
+        k = o + len(s.wind) + i
+        sd = prm.drag_mu_sd if i == 0 else (prm.drag_c_sd if i == 1 else prm.drag_offset_sd)
+        s.drag[i] = math.log(prm.drag_mu) if i == 0 else (math.log(prm.drag_c) if i == 1 else 0.0)
+        P[k, k] = sd * sd
+        scale = prm.drag_mu
+    for i in range(len(s.wind)):
+        sd = scale * (prm.init_wind if i < 2 else prm.init_wind_d)
+        s.wind[i] = 0.0
+        P[o + i, o + i] = sd * sd
+    for i in range(len(s.steady)):  # all that is known of the wind before any is felt is known of its mean
+        k = o + len(s.wind) + len(s.drag) + i
+        s.steady[i] = 0.0
+        P[k, k] = P[o + i, o + i]
+        P[o + i, k], P[k, o + i] = P[k, k], P[k, k]
+        P[o + i, o + i] += scale * scale * prm.wind_gust * prm.wind_gust
+    for i in range(len(s.vane)):
+        k = o + len(s.wind) + len(s.drag) + len(s.steady) + i
+        sd = prm.init_airspeed_scale if i == 0 else prm.init_vane
+        s.vane[i] = 0.0
+        P[k, k] = sd * sd
+    drag.forget(s)
+
+
+@jit
 def start(s: Any, prm: Any, kind: int, f_b: Vec, a_n: Vec) -> None:
     """Set nominal state and P0, and let the filter run (theory-amendments.md §8, P0)."""
     a = s.align
@@ -202,15 +240,20 @@ def start(s: Any, prm: Any, kind: int, f_b: Vec, a_n: Vec) -> None:
         s.dx[i] = 0.0
         for j in range(n):
             P[i, j] = 0.0
-    known = passed or kind == TWO_SPANS
+    given = s.t - a.t_given < WAIT_GIVEN
+    if given:
+        q0, q1, q2, q3 = a.given[0], a.given[1], a.given[2], a.given[3]
+        s.q[0], s.q[1], s.q[2], s.q[3] = q0, q1, q2, q3
+    known = passed or given or kind == TWO_SPANS
     d = dcm((q0, q1, q2, q3))[2]
     if not known:  # without a compass the turn about the specific force is unknown; at rest that is the vertical
         d = scale(f_b, 1.0 / norm(f_b))
     tilt = prm.init_tilt_rest if kind == AT_REST else prm.init_tilt_motion
     from_bias = prm.init_accel_bias / s.gravity
-    tilt2 = tilt * tilt + from_bias * from_bias
     yaw = prm.init_yaw_compass if passed else (YAW_TWO_SPANS if known else prm.init_yaw_unknown)
-    yaw2 = yaw * yaw
+    if given:
+        tilt, from_bias, yaw = 2.0 * prm.noise_attitude, 0.0, 2.0 * prm.noise_attitude_yaw
+    tilt2, yaw2 = tilt * tilt + from_bias * from_bias, yaw * yaw
     for i in range(3):
         for j in range(3):
             P[i, j] = (yaw2 - tilt2) * d[i] * d[j]
@@ -241,6 +284,7 @@ def start(s: Any, prm: Any, kind: int, f_b: Vec, a_n: Vec) -> None:
     for i in range(len(s.mag)):
         s.mag[i] = 0.0
         P[o + i, o + i] = prm.init_mag_offset * prm.init_mag_offset
+    start_air(s, prm, o + len(s.mag))
     for k2 in range(len(s.aid)):
         s.aid[k2].t_passed = s.t
         s.aid[k2].t_due = s.t
@@ -289,6 +333,10 @@ def gather(s: Any, prm: Any, rotation: Vec, dv: Vec, dt: float) -> None:
     at_rest = s.rest.still == 1 and not (gnss_recent and gnss_speed > 0.5 + 2.0 * a.gnss_v_sd[0])
     if at_rest and compass_there:
         start(s, prm, AT_REST, (s.rest.mean_f[0], s.rest.mean_f[1], s.rest.mean_f[2]), (0.0, 0.0, 0.0))
+        return
+    if s.t - a.t_given < WAIT_GIVEN and not at_rest and (gnss_recent or waited > WAIT_COMPASS):
+        f_b = tmat_vec(dcm(q), (a.f[0], a.f[1], a.f[2]))
+        start(s, prm, GIVEN, f_b if norm(f_b) > 0.0 else (0.0, 0.0, -1.0), (0.0, 0.0, 0.0))
         return
     if not judged:
         return

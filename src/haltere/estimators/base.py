@@ -11,11 +11,23 @@ import numpy as np
 from numpy.typing import NDArray
 
 from haltere._jit import as_records
-from haltere.aids.record import AID_RECORD, BAROMETER, GNSS_POSITION, GNSS_VELOCITY, MAGNETOMETER, POWER
+from haltere.aids.record import (
+    AID_RECORD,
+    AIRSPEED,
+    ATTITUDE,
+    BAROMETER,
+    GNSS_POSITION,
+    GNSS_VELOCITY,
+    MAGNETOMETER,
+    POWER,
+    ROTORS,
+    VANES,
+    WIND,
+)
 from haltere.core.earth import STANDARD_GRAVITY, gravity
 from haltere.errors import HaltereError, UsageError
 from haltere.estimators import step as kernels
-from haltere.estimators.inputs import altitude_of, parameters
+from haltere.estimators.inputs import altitude_of, parameters, rotation_vector
 from haltere.flight import config as configuration
 from haltere.flight.config import Config
 from haltere.flight.corrections import calibrated, calibration
@@ -34,6 +46,10 @@ _VALUES = {
     "barometer": ("pressure",),
     "magnetometer": ("mag_x", "mag_y", "mag_z"),
     "power": ("current",),
+    "airdata": ("airspeed", "aoa", "sideslip"),
+    "wind": ("wind_n", "wind_e", "wind_d", "sd"),
+    "attitude": ("q_w", "q_x", "q_y", "q_z"),
+    "rotors": (),
 }
 _ACCURACIES = ("h_acc", "h_acc", "v_acc", "s_acc", "s_acc", "s_acc")
 
@@ -116,8 +132,7 @@ class InitialState:
 
 def new_state(config: Config, initial: InitialState | None = None) -> NDArray[np.void]:
     """State record, one element, that has seen nothing yet."""
-    offsets = 1 if config["baro.offset"] == "on" else 0, 3 if config["magnetometer.refine"] == "on" else 0
-    record = as_records(np.zeros(1, layout(*offsets, 1 if config.estimator == "two-stage" else 0)))
+    record = as_records(np.zeros(1, layout(**_sizes(config))))
     record["q"][0, 0] = 1.0
     home = (config.number("home.lat"), config.number("home.lon"), config.number("home.alt"))
     record["gravity"] = STANDARD_GRAVITY
@@ -134,6 +149,20 @@ def new_state(config: Config, initial: InitialState | None = None) -> NDArray[np
     if initial is not None:
         _begin_from(record, initial)
     return record
+
+
+def _sizes(config: Config) -> dict[str, int]:
+    """Number of optional states of each kind, as `haltere.strapdown.layout.layout` takes them."""
+    drag, airdata = config["aid.drag"] == "on", config["aid.airdata"] == "on"
+    vanes = airdata and config["aid.vanes"] == "on"
+    return {
+        "baro": 1 if config["baro.offset"] == "on" else 0,
+        "mag": 3 if config["magnetometer.refine"] == "on" else 0,
+        "stages": 1 if config.estimator == "two-stage" else 0,
+        "wind": (3 if vanes and not drag else 2) if drag or airdata else 0,
+        "drag": 4 if drag else 0,
+        "vane": (3 if vanes else 1) if airdata else 0,
+    }
 
 
 def _begin_from(record: NDArray[np.void], initial: InitialState) -> None:
@@ -247,13 +276,14 @@ class Estimator:
         Parameters
         ----------
         sensor
-            ``gnss``, ``barometer``, ``magnetometer`` or ``power``.
+            ``gnss``, ``barometer``, ``magnetometer``, ``power``, ``rotors``, ``airdata``, ``wind`` or ``attitude``.
         t
             Time stamp [s]; it was valid at t minus the configured delay.
         values
             By column name as in the flight folder, or in order: gnss ``lat, lon, alt[, vel_n, vel_e, vel_d]`` (deg, m, m/s),
             barometer ``pressure`` [Pa], magnetometer ``mag_x, mag_y, mag_z`` [uT], to which a calibration (``magnetometer.*``) is applied,
-            power ``current`` [A].
+            power ``current`` [A], rotors the speeds of all [rad/s], airdata ``airspeed[, aoa, sideslip]``, wind
+            ``wind_n, wind_e[, wind_d, sd]`` [m/s, blowing to], attitude ``q_w, q_x, q_y, q_z``.
         variances
             Of the values in order, for gnss (lat, lon and alt in m^2); NaN, not positive or absent: as configured.
 
@@ -271,7 +301,7 @@ class Estimator:
         if sensor not in _VALUES:
             near = nearest_stream(str(sensor), _VALUES)
             raise UsageError(
-                "a sensor: gnss, barometer, magnetometer or power",
+                f"a sensor: {', '.join(_VALUES)}",
                 repr(sensor),
                 "Estimator.offer",
                 f"did you mean {near!r}?" if near else "",
@@ -290,6 +320,8 @@ class Estimator:
             return (
                 self._queue(POWER, t, (current, math.nan, math.nan), _NAN) if math.isfinite(current) else self._refuse(sensor, "not finite")
             )
+        if sensor in ("rotors", "airdata", "wind", "attitude"):
+            return self._offer_of_the_air(sensor, t, values)
         m = _in_order(sensor, values, 3)
         if not math.isfinite(m[0] + m[1] + m[2]):
             return self._refuse(sensor, "not finite")
@@ -336,6 +368,26 @@ class Estimator:
         if not math.isfinite(h):
             return self._refuse("barometer", "not finite")
         return self._queue(BAROMETER, t, (h, math.nan, math.nan), _NAN)
+
+    def _offer_of_the_air(self, sensor: str, t: float, values: Sequence[float] | Mapping[str, float]) -> bool:
+        if sensor == "rotors":
+            speeds = values.values() if isinstance(values, Mapping) else _flat(values, "values of rotors")
+            total = sum(abs(_number(x, "a rotor's speed", "Estimator.offer")) for x in speeds)
+            return self._queue(ROTORS, t, (total, math.nan, math.nan), _NAN) if math.isfinite(total) else self._refuse(sensor, "not finite")
+        v = _in_order(sensor, values, {"airdata": 1, "wind": 2, "attitude": 4}[sensor])
+        if sensor == "airdata":
+            taken = math.isfinite(v[0]) and self._queue(AIRSPEED, t, (v[0], math.nan, math.nan), _NAN)
+            vanes = math.isfinite(v[1] + v[2]) and self._queue(VANES, t, (v[1], v[2], math.nan), _NAN)
+            return taken or vanes or (not math.isfinite(v[0]) and self._refuse(sensor, "not finite"))
+        if sensor == "wind":
+            if not math.isfinite(v[0] + v[1]):
+                return self._refuse(sensor, "not finite")
+            r = v[3] * v[3] if v[3] > 0.0 else math.nan
+            return self._queue(WIND, t, (v[0], v[1], v[2]), (r, r, r))
+        if not math.isfinite(sum(v)) or not 0.9 < math.hypot(*v) < 1.1:
+            return self._refuse(sensor, "not a unit quaternion")
+        x, y, z = rotation_vector(np.array([v]))[0].tolist()
+        return self._queue(ATTITUDE, t, (x, y, z), _NAN)
 
     def _queue(self, kind: int, t: float, z: tuple[float, float, float], r: tuple[float, float, float]) -> bool:
         return bool(kernels.offer(self._S, self._prm, kind, t, z, r) in (1, -1))

@@ -12,7 +12,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from haltere._jit import as_records, entry
-from haltere.aids.record import BAROMETER, GNSS_POSITION, GNSS_VELOCITY, MAGNETOMETER, POWER
+from haltere.aids.record import (
+    AIRSPEED,
+    ATTITUDE,
+    BAROMETER,
+    GNSS_POSITION,
+    GNSS_VELOCITY,
+    MAGNETOMETER,
+    POWER,
+    ROTORS,
+    VANES,
+    WIND,
+)
 from haltere.core.earth import pressure_altitude
 from haltere.errors import UsageError
 from haltere.flight import config as configuration
@@ -23,7 +34,7 @@ from haltere.flight.field import decimal_year, earth_field
 from haltere.flight.log import FlightLog, Stream
 from haltere.strapdown.layout import PARAMETERS
 
-__all__ = ["Measurements", "configure", "horizon", "imu_arrays", "measurements", "parameters", "request"]
+__all__ = ["Measurements", "configure", "horizon", "imu_arrays", "measurements", "parameters", "request", "rotation_vector"]
 
 FloatArray = NDArray[np.float64]
 
@@ -106,7 +117,26 @@ def configure(
                 values[f"field.{key}"] = value
     if math.isnan(float(values["field.declination"])):
         values["field.declination"] = 0.0
-    return Config(estimator, preset, values)
+    return Config(estimator, preset, values | _decided(checked, values))
+
+
+def _decided(checked: Checked, values: Mapping[str, Any]) -> dict[str, Any]:
+    """What ``auto`` comes to with the streams of a flight."""
+    rotors, airdata = checked.streams.get("rotors"), checked.streams.get("airdata")
+    fly = rotors is not None and rotor_count(rotors) >= 3
+    tube = airdata is not None and bool(np.isfinite(airdata.get("airspeed")).any())
+    vanes = airdata is not None and bool(np.isfinite(airdata.get("aoa") + airdata.get("sideslip")).any())
+    found = {"aid.drag": fly, "aid.airdata": tube, "aid.vanes": vanes, "aid.no_sideslip": tube and not (vanes or fly)}
+    return {key: "on" if there else "off" for key, there in found.items() if values[key] == "auto"}
+
+
+def rotor_count(rotors: Stream) -> int:
+    """Rotors of a stream that ever turned, by their speeds, or where there are none by their commands."""
+    for stem in ("speed_", "command_"):
+        columns = [rotors[c] for c in rotors.names if c.startswith(stem)]
+        if columns:
+            return sum(bool(np.any(np.nan_to_num(v) != 0.0)) for v in columns)
+    return 0
 
 
 def _spread(keys: Mapping[str, Any]) -> dict[str, Any]:
@@ -159,9 +189,48 @@ def _variances(stream: Stream, *names: str) -> FloatArray:
     return np.where(sd > 0.0, sd * sd, np.nan)
 
 
+def rotation_vector(q: FloatArray) -> FloatArray:
+    """Rotation vectors (n, 3) [rad] of quaternions (n, 4), scalar first, of any length."""
+    q = q / np.linalg.norm(q, axis=1)[:, None] * np.where(q[:, :1] < 0.0, -1.0, 1.0)
+    size = np.linalg.norm(q[:, 1:], axis=1)
+    angle = 2.0 * np.arctan2(size, q[:, 0])
+    return np.asarray(q[:, 1:] * np.where(size > 1e-12, angle / np.maximum(size, 1e-12), 2.0)[:, None])
+
+
+Part = tuple[int, FloatArray, FloatArray, FloatArray]
+
+
+def _of_the_air(checked: Checked, config: Config) -> list[Part]:
+    """Rotor speeds, air data, and what is told from outside."""
+    parts: list[Part] = []
+
+    def add(code: int, t: FloatArray, z: FloatArray, r: FloatArray | None = None) -> None:
+        there = np.isfinite(z[:, 0])
+        wide = np.full((int(there.sum()), 3), np.nan)
+        wide[:, : z.shape[1]] = z[there]
+        parts.append((code, t[there], wide, np.full_like(wide, np.nan) if r is None else r[there]))
+
+    rotors, airdata = checked.streams.get("rotors"), checked.streams.get("airdata")
+    if rotors is not None and config["aid.drag"] == "on":
+        speeds = [rotors[c] for c in rotors.names if c.startswith("speed_")]
+        if speeds:
+            add(ROTORS, rotors.t, np.sum(np.abs(speeds), axis=0)[:, None])
+    if airdata is not None and config["aid.airdata"] == "on":
+        add(AIRSPEED, airdata.t, airdata.get("airspeed")[:, None])
+        if config["aid.vanes"] == "on":
+            vanes = np.column_stack([airdata.get("aoa"), airdata.get("sideslip")])
+            add(VANES, airdata.t, np.where(np.isfinite(vanes).all(axis=1)[:, None], vanes, np.nan))
+    wind, attitude = checked.streams.get("wind"), checked.streams.get("attitude")
+    if wind is not None and config["aid.wind"] == "on" and "on" in (config["aid.drag"], config["aid.airdata"]):
+        add(WIND, wind.t, wind.vector("wind", "ned"), _variances(wind, "sd", "sd", "sd"))
+    if attitude is not None and config["aid.attitude"] == "on":
+        add(ATTITUDE, attitude.t, rotation_vector(attitude.vector("q", "wxyz")))
+    return parts
+
+
 def measurements(flight: FlightLog, checked: Checked, config: Config) -> Measurements:
     """Measurements that the configuration lets in, in the order of their stamps (ties: the order of the sensor codes)."""
-    parts: list[tuple[int, FloatArray, FloatArray, FloatArray]] = []
+    parts: list[Part] = []
     gnss = checked.streams.get("gnss")
     if gnss is not None and config["aid.gnss"] == "on":
         v, r_v = gnss.vector("vel", "ned"), _variances(gnss, "s_acc", "s_acc", "s_acc")
@@ -184,6 +253,7 @@ def measurements(flight: FlightLog, checked: Checked, config: Config) -> Measure
         current = power.get("current")
         value = np.column_stack([current, np.full((len(power), 2), np.nan)])
         parts.append((POWER, power.t, value, np.full_like(value, np.nan)))
+    parts += _of_the_air(checked, config)
     if not parts:
         return Measurements(np.empty(0, np.int64), np.empty(0), np.empty((0, 3)), np.empty((0, 3)))
     kind = np.concatenate([np.full(len(t), k, np.int64) for k, t, _, _ in parts])

@@ -11,6 +11,7 @@ from typing import Any
 from haltere._jit import jit
 from haltere.core.rotation import Mat, Quat, Vec, cross, dcm, quat_from_rotvec, quat_mul, quat_unit
 from haltere.estimators.dense import multiply, smaller_than, solve, solve_any, turn_attitude, turn_block
+from haltere.strapdown.optional import get_optional, put_optional
 
 __all__ = ["NODE_HEAD", "corrected", "enter", "keep", "load_node", "past"]
 
@@ -30,9 +31,8 @@ def load_node(s: Any, node: Any) -> None:
         s.q[i] = node[3 + i]
     for i in range(3):
         s.v[i], s.p[i], s.bg[i], s.ba[i] = node[7 + i], node[10 + i], node[13 + i], node[16 + i]
-    for i in range(len(s.baro)):
-        s.baro[i] = node[NODE_HEAD + i]
-    k = NODE_HEAD + len(s.baro)
+    put_optional(s, node, NODE_HEAD)
+    k = NODE_HEAD + s.P.shape[0] - 15
     for i in range(s.P.shape[0]):
         for j in range(i, s.P.shape[0]):
             s.P[i, j] = node[k]
@@ -48,8 +48,7 @@ def keep(s: Any, w: Any, k: int) -> None:
         x[i] = s.q[i]
     for i in range(3):
         x[4 + i], x[7 + i], x[10 + i], x[13 + i] = s.v[i], s.p[i], s.bg[i], s.ba[i]
-    for i in range(len(s.baro)):
-        x[16 + i] = s.baro[i]
+    get_optional(s, x, 16)
     for i in range(s.P.shape[0]):
         for j in range(s.P.shape[0]):
             w.P[k, i, j] = s.P[i, j]

@@ -34,7 +34,17 @@ from haltere._jit import as_records, entry, jit
 from haltere.core.rotation import Vec, dcm
 from haltere.estimators.dense import turn_block
 from haltere.estimators.nodes import NODE_HEAD, corrected, enter, keep, load_node, past
-from haltere.estimators.step import ASSUMED, COVARIANCE_ROWS, LONG_STEP, SUB_STEP, bridge_push, interval
+from haltere.estimators.step import (
+    ASSUMED,
+    COVARIANCE_ROWS,
+    LONG_STEP,
+    SUB_STEP,
+    bridge_push,
+    interval,
+    reported_wind,
+    write_wind_covariance,
+)
+from haltere.strapdown.optional import put_optional
 from haltere.strapdown.propagate import left_F, mechanise, propagate, transition
 
 __all__ = ["BUFFER", "node_width", "smooth", "smoothed"]
@@ -45,13 +55,13 @@ FloatArray = NDArray[np.float64]
 BUFFER = 160
 
 
-def node_width(n: int, n_baro: int) -> int:
+def node_width(n: int) -> int:
     """Columns of a node of ``n`` error states."""
-    return NODE_HEAD + n_baro + n * (n + 1) // 2
+    return NODE_HEAD + n - 15 + n * (n + 1) // 2
 
 
 @cache
-def _workspace(n: int, n_baro: int) -> np.dtype[np.void]:
+def _workspace(n: int) -> np.dtype[np.void]:
     """Record type to work in: the predictions of one interval, μ, the smoothed state and matrices.
 
     Matrices are as wide as a multiple of four, with ones on the diagonal where there is no state: so every inner loop becomes SIMD.
@@ -61,10 +71,10 @@ def _workspace(n: int, n_baro: int) -> np.dtype[np.void]:
     system = np.dtype((np.record, [("P", "f8", (m, 2 * m + 4))]), align=True)
     return np.dtype(
         [
-            ("x", "f8", (b, 16 + n_baro)), ("P", "f8", (b, m, m)), ("phi", "f8", (b, 3, 3, 3)), ("dt", "f8", b), ("row", "i8", b),
+            ("x", "f8", (b, 1 + n)), ("P", "f8", (b, m, m)), ("phi", "f8", (b, 3, 3, 3)), ("dt", "f8", b), ("row", "i8", b),
             ("system", system), ("W", "f8", (m, m)), ("D", "f8", (m, m)), ("T", "f8", (m, m)),
             ("first", "f8", (m, m)), ("last", "f8", (m, m)), ("between", "f8", (m, m)), ("turned", "f8", (3, 3, 3)),
-            ("r", "f8", (4, 2 * m + 4)), ("mu", "f8", n), ("later", "f8", n), ("d", "f8", n), ("xs", "f8", 16 + n_baro),
+            ("r", "f8", (4, 2 * m + 4)), ("mu", "f8", n), ("later", "f8", n), ("d", "f8", n), ("xs", "f8", 1 + n),
         ],
         align=True,
     )  # fmt: skip
@@ -94,7 +104,7 @@ def smoothed(
     rows, covariance, lost
         Like ``rows``; (`haltere.estimators.step.COVARIANCE_ROWS`, c); fusions that could not be smoothed over.
     """
-    n, n_baro = S["P"].shape[1], S["baro"].shape[1]
+    n = S["P"].shape[1]
     times = rows[0]
     at = np.searchsorted(t, times)
     node_row = np.searchsorted(times, nodes[:, 0])
@@ -104,7 +114,7 @@ def smoothed(
     cov = np.empty((COVARIANCE_ROWS, len(t_covariance)))
     column = np.full(len(times), -1)
     column[np.searchsorted(times, t_covariance)] = np.arange(len(t_covariance))
-    work, w = as_records(np.zeros(1, S.dtype)), as_records(np.zeros(1, _workspace(n, n_baro)))
+    work, w = as_records(np.zeros(1, S.dtype)), as_records(np.zeros(1, _workspace(n)))
     w["P"] = np.eye(w["P"].shape[-1])  # where there is no state it stays so
     lost = smooth(work, prm, w, nodes, node_row, last_row, times, gyro[at], accel[at], out, cov, column)
     return out, cov, int(lost)
@@ -202,7 +212,7 @@ def blend(w: Any, k: int, c: float, whole: bool) -> None:
 
 
 @jit
-def write(w: Any, out: Any, cov: Any, column: int, row: int, t: float, n_baro: int) -> None:
+def write(s: Any, w: Any, out: Any, cov: Any, column: int, row: int, t: float) -> None:
     """``w.xs`` and ``w.between`` into column ``row`` of the output, ordered as by `haltere.estimators.step.write_row`, and of ``cov``."""
     y, P = w.xs, w.between
     out[0, row] = t
@@ -216,9 +226,14 @@ def write(w: Any, out: Any, cov: Any, column: int, row: int, t: float, n_baro: i
     for b in range(4):
         for i in range(3):
             out[23 + 3 * b + i, row] = P[3 + 3 * b + i, 3 + 3 * b + i]
-    for i in range(n_baro):
+    more = s.P.shape[0] - 15
+    for i in range(more):
         out[35 + i, row] = y[16 + i]
-        out[35 + n_baro + i, row] = P[15 + i, 15 + i]
+        out[35 + more + i, row] = P[15 + i, 15 + i]
+    put_optional(s, y, 16)
+    if len(s.drag) > 0:
+        k = 35 + len(s.baro) + len(s.mag)
+        reported_wind(s, P, out[:, row], k, more)
     if column < 0:
         return
     cov[0, column] = t
@@ -229,8 +244,9 @@ def write(w: Any, out: Any, cov: Any, column: int, row: int, t: float, n_baro: i
                 cov[k, column] = P[3 * b + i, 3 * b + j]
                 k += 1
     cov[k, column] = math.nan
-    for i in range(n_baro):
+    for i in range(len(s.baro)):
         cov[k, column] = P[15 + i, 15 + i]
+    write_wind_covariance(s, P, cov, column)
 
 
 @entry
@@ -256,7 +272,7 @@ def smooth(
         Fusions whose covariance could not be inverted: the stretch before is smoothed on its own.
     """
     s, prm, w = S[0], PRM[0], W[0]
-    n_baro = len(s.baro)
+    whole = len(s.drag) > 0
     lost = 0
     for j in range(len(nodes) - 1, -1, -1):
         a = node_row[j]
@@ -281,7 +297,7 @@ def smooth(
                     for i in range(w.W.shape[0]):
                         for c in range(w.W.shape[0]):
                             w.between[i, c] = w.P[k, i, c]
-                    write(w, out, cov, column[w.row[k]], w.row[k], t[w.row[k]], n_baro)
+                    write(s, w, out, cov, column[w.row[k]], w.row[k], t[w.row[k]])
             for i in range(w.W.shape[0]):
                 for c in range(w.W.shape[0]):
                     w.first[i, c] = w.P[0, i, c]
@@ -290,6 +306,6 @@ def smooth(
             back(w, k)
             if w.row[k] >= 0:
                 corrected(w, k)
-                blend(w, k, (t[w.row[k]] - t[a]) / (t[b] - t[a]), column[w.row[k]] >= 0)
-                write(w, out, cov, column[w.row[k]], w.row[k], t[w.row[k]], n_baro)
+                blend(w, k, (t[w.row[k]] - t[a]) / (t[b] - t[a]), whole or column[w.row[k]] >= 0)
+                write(s, w, out, cov, column[w.row[k]], w.row[k], t[w.row[k]])
     return lost

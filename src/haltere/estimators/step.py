@@ -6,9 +6,12 @@ import math
 from typing import Any
 
 from haltere._jit import entry, jit
-from haltere.aids import fake, first_stage, rest
+from haltere.aids import drag, fake, first_stage, rest
+from haltere.aids.air import wind_covariance, wind_n
 from haltere.aids.dispatch import N_SENSORS, fuse_all
 from haltere.aids.record import (
+    AIRSPEED,
+    ATTITUDE,
     BAROMETER,
     E_DIVERGED,
     E_GAP,
@@ -18,11 +21,15 @@ from haltere.aids.record import (
     MAGNETOMETER,
     NO_SENSOR,
     POWER,
+    ROTORS,
+    VANES,
+    WIND,
     event,
 )
 from haltere.core.rotation import Vec, cross, dcm, mat_vec, quat_from_rotvec, quat_mul
 from haltere.estimators import alignment, yaw_bank
 from haltere.filter.queue import pop_imu, push, push_imu
+from haltere.strapdown.optional import get_optional
 from haltere.strapdown.propagate import predict
 
 __all__ = [
@@ -44,8 +51,9 @@ __all__ = [
     "step",
 ]
 
-#: Rows of the covariance output: time, the upper triangles of the five core blocks, the variance of the barometer offset.
-COVARIANCE_ROWS = 1 + 5 * 6 + 1
+#: Rows of the covariance output: time, the upper triangles of the five core blocks, the variance of the barometer offset, the upper
+#: triangle of the wind's covariance.
+COVARIANCE_ROWS = 1 + 5 * 6 + 1 + 6
 #: Longest interval [s] bridged in one step, and longest gap [s] bridged at all.
 LONG_STEP, SUB_STEP = 0.1, 0.05
 #: A tape for smoothing has a node after each fusion, at least after so many predictions, and about every so many seconds.
@@ -62,9 +70,20 @@ def stage_of(S: Any) -> Any:
 
 
 @entry
-def row_width(n_baro: int, n_mag: int = 0) -> int:
-    """Columns of the output rows: t, q 4, v 3, p 3, bg 3, ba 3, baro; P_θθ upper triangle 6, other variances 12, baro; mag, its own."""
-    return 35 + 2 * n_baro + 2 * n_mag
+def row_width(n: int) -> int:
+    """Columns of the output rows of ``n`` error states.
+
+    t, q 4, v 3, p 3, bg 3, ba 3; P_θθ upper triangle 6, other variances 12; optional states, their variances.
+    """
+    return 35 + 2 * (n - 15)
+
+
+@jit
+def reported_wind(s: Any, P: Any, row: Any, k: int, more: int) -> None:
+    """The wind and its variances into columns k, k + ``more`` of a row, where the state is µW instead, see `haltere.aids.air`."""
+    W, cov = wind_n(s), wind_covariance(s, P)
+    row[k], row[k + 1] = W[0], W[1]
+    row[k + more], row[k + more + 1] = cov[0], cov[3]
 
 
 @jit
@@ -92,14 +111,25 @@ def write_row(s: Any, rows: Any) -> None:
     rows[i, 20] = P[1, 1]
     rows[i, 21] = P[1, 2]
     rows[i, 22] = P[2, 2]
-    for j in range(len(s.baro)):
-        rows[i, 35 + j] = s.baro[j]
-        rows[i, 35 + len(s.baro) + j] = P[15 + j, 15 + j]
-    o, k = 15 + len(s.baro), 35 + 2 * len(s.baro)
-    for j in range(len(s.mag)):
-        rows[i, k + j] = s.mag[j]
-        rows[i, k + len(s.mag) + j] = P[o + j, o + j]
+    more = P.shape[0] - 15
+    get_optional(s, rows[i], 35)
+    for j in range(more):
+        rows[i, 35 + more + j] = P[15 + j, 15 + j]
+    if len(s.drag) > 0:
+        reported_wind(s, P, rows[i], 35 + len(s.baro) + len(s.mag), more)
     s.n_rows = i + 1
+
+
+@jit
+def write_wind_covariance(s: Any, P: Any, cov: Any, i: int) -> None:
+    """Covariance of the wind into column i, NaN for what is no state."""
+    c = wind_covariance(s, P)
+    for k in range(6):
+        cov[32 + k, i] = math.nan
+    if len(s.wind) > 0:
+        cov[32, i], cov[33, i], cov[35, i] = c[0], c[1], c[3]
+    if len(s.wind) > 2:
+        cov[34, i], cov[36, i], cov[37, i] = c[2], c[4], c[5]
 
 
 @jit
@@ -119,6 +149,7 @@ def write_covariance(s: Any, prm: Any, cov: Any) -> None:
     cov[k, i] = math.nan
     for j in range(len(s.baro)):
         cov[k, i] = s.P[15 + j, 15 + j]
+    write_wind_covariance(s, s.P, cov, i)
     s.n_cov = i + 1
 
 
@@ -135,9 +166,8 @@ def write_node(s: Any, tape: Any, kind: float) -> None:
     for j in range(3):
         node[7 + j], node[10 + j], node[13 + j], node[16 + j] = s.v[j], s.p[j], s.bg[j], s.ba[j]
     k = 19
-    for j in range(len(s.baro)):
-        node[k] = s.baro[j]
-        k += 1
+    get_optional(s, node, k)
+    k += s.P.shape[0] - 15
     for r in range(s.P.shape[0]):
         for c in range(r, s.P.shape[0]):
             node[k] = s.P[r, c]
@@ -294,6 +324,8 @@ def advance(s: Any, prm: Any, rows: Any, cov: Any, aids: Any, tape: Any, stage: 
             predict_stage(s, stage, prm, w0, f0, w1, f1, dt)
         s.yaw.dv[0] += s.v[0] - north
         s.yaw.dv[1] += s.v[1] - east
+        if len(s.drag) > 0:
+            drag.gather(s, f1, dt)
         if t >= s.t_wake:
             for part in range(2):  # what is measured, then what is assumed; one call, since with a second one it is compiled twice
                 if part == 1 and fake.blind_to_heading(s, prm):
@@ -397,6 +429,14 @@ def offer(S: Any, PRM: Any, kind: int, t: float, z: Vec, r: Vec) -> int:
         delay, on = prm.delay_magnetometer, prm.aid_magnetometer
     elif kind == POWER:
         delay, on = prm.delay_power, prm.aid_motor_field
+    elif kind == ROTORS:
+        delay, on = prm.delay_rotors, 1.0 if prm.aid_drag == 1.0 else 0.0
+    elif kind in (AIRSPEED, VANES):
+        delay, on = prm.delay_airdata, 1.0 if prm.aid_airdata == 1.0 else 0.0
+    elif kind == WIND:
+        delay, on = prm.delay_wind, prm.aid_wind
+    elif kind == ATTITUDE:
+        delay, on = prm.delay_attitude, prm.aid_attitude
     if on == 0.0:
         return 2
     return push(s, kind, t - delay, z, r)

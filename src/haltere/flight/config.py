@@ -110,6 +110,30 @@ KEYS: dict[str, Key] = {
         "m/s",
         "Fake velocity of ahrs, 1 sigma at 5 Hz: worth 2 m/s that last a second. Lower trusts gravity more, accelerations less.",
     ),
+    "noise.wind": _positive(
+        0.3, "m/s/sqrt(s)", "Walk of the horizontal wind that air data show. Higher follows gusts sooner, and is less sure."
+    ),
+    "noise.wind_mean": _positive(0.05, "m/s/sqrt(s)", "Walk of the mean wind of a multirotor, which gusts return to."),
+    "wind.gust": _positive(0.3, "m/s", "Gusts of a multirotor's wind, 1 sigma in calm air."),
+    "wind.turbulence": Key(0.2, "1", "Gusts more in proportion to the mean wind.", low=0.0, high=2.0),
+    "wind.gust_time": _positive(3.0, "s", "How long a gust lasts."),
+    "noise.wind_d": _positive(0.1, "m/s/sqrt(s)", "Walk of the vertical wind."),
+    "noise.air_walk": _positive(
+        2e-3, "1/sqrt(s)", "Walk of what air data depend on: relative for drag and airspeed scale, in m/s^2 and rad for offsets."
+    ),
+    "noise.airspeed": _positive(1.0, "m/s", "Airspeed, 1 sigma, alike in all samples of noise.airdata_time."),
+    "noise.aoa": _positive(2.0 * DEG, "rad", "Vane of the angle of attack, 1 sigma, likewise."),
+    "noise.sideslip": _positive(2.0 * DEG, "rad", "Vane of the sideslip, 1 sigma, likewise."),
+    "noise.airdata_time": Key(0.5, "s", "How long errors of air data last (gusts shorter than that, the tube's lag).", low=0.0),
+    "noise.no_sideslip": _positive(6.0 * DEG, "rad", "Sideslip of an aeroplane without vanes, 1 sigma, likewise."),
+    "noise.drag": _positive(0.2, "m/s^2", "What the drag model misses, 1 sigma, alike in all samples of noise.drag_time."),
+    "noise.drag_time": Key(0.2, "s", "That correlation time.", low=0.0),
+    "noise.given_wind": _positive(1.0, "m/s", "Wind told from outside, 1 sigma, where no sd is told with it."),
+    "noise.attitude": _positive(1.0 * DEG, "rad", "Roll and pitch told from outside, 1 sigma."),
+    "noise.attitude_yaw": _positive(2.0 * DEG, "rad", "Yaw told from outside, 1 sigma."),
+    "noise.attitude_time": Key(1.0, "s", "How long the errors of a told attitude last.", low=0.0),
+    "gate.air": _positive(5.0, "sigma", "Innovation gate of airspeed, vanes, drag and told wind."),
+    "gate.attitude": _positive(5.0, "sigma", "Innovation gate of a told attitude."),
     "gate.gnss": _positive(5.0, "sigma", "Innovation gate of GNSS position and velocity, joint over the components."),
     "gate.barometer": _positive(5.0, "sigma", "Innovation gate of the barometer."),
     "gate.magnetometer": _positive(6.0, "sigma", "Innovation gate of the magnetometer."),
@@ -119,6 +143,10 @@ KEYS: dict[str, Key] = {
     "delay.gnss_position": _delay("The same for position."),
     "delay.barometer": _delay("The same for the barometer."),
     "delay.magnetometer": _delay("The same for the magnetometer."),
+    "delay.rotors": _delay("The same for rotor speeds."),
+    "delay.airdata": _delay("The same for airspeed and vanes."),
+    "delay.wind": _delay("The same for a told wind."),
+    "delay.attitude": _delay("The same for a told attitude."),
     "aid.gnss": _switch("on", "Use GNSS position and velocity."),
     "aid.barometer": _switch("on", "Use the barometer."),
     "aid.magnetometer": _switch(
@@ -132,6 +160,40 @@ KEYS: dict[str, Key] = {
     "aid.fake_position": _switch("on", "Fake position while nothing else holds it."),
     "aid.yaw_bank": _switch("on", "Set yaw from GNSS velocity where it is unknown, or contradicted by it."),
     "aid.fake_velocity": _switch("off", "Fake zero velocity, always on in ahrs."),
+    "aid.drag": _switch(
+        "auto",
+        "Estimate the horizontal wind of a multirotor from its drag, and the drag with it; auto: where at least three rotors turn.",
+        ("off", "on", "auto"),
+    ),
+    "aid.airdata": _switch(
+        "auto",
+        "Estimate the wind from airspeed and vanes, and their scale and offsets with it; auto: where the log has them.",
+        ("off", "on", "auto"),
+    ),
+    "aid.vanes": _switch(
+        "auto",
+        "Use vanes of angle of attack and sideslip, and estimate the vertical wind too; auto: where the log has both.",
+        ("off", "on", "auto"),
+    ),
+    "aid.no_sideslip": _switch(
+        "auto", "Take an aeroplane to fly straight through the air; auto: with airspeed, without vanes and rotors.", ("off", "on", "auto")
+    ),
+    "aid.wind": _switch("on", "Use the stream wind, told from outside, where wind is estimated."),
+    "aid.attitude": _switch("on", "Use the stream attitude, told from outside."),
+    "air.moves": _switch(
+        "wind",
+        "What measurements of the air may move while GNSS is heard: only the wind and their own coefficients, or the whole state.",
+        ("wind", "all"),
+    ),
+    "air.density": _positive(math.nan, "kg/m^3", "Air density at the origin. Default: standard atmosphere at its altitude."),
+    "air.airspeed_min": _positive(4.0, "m/s", "Airspeeds below this say nothing."),
+    "drag.mu": _positive(0.3, "1/s", "Rotor drag over mass and speed at hover, standard atmosphere at sea level: as begun with."),
+    "drag.mu_sd": _positive(0.35, "1", "Its relative 1 sigma, log-normal. `haltere identify --drag` finds both."),
+    "drag.c": _positive(0.008, "1/m", "Quadratic drag over mass, standard atmosphere at sea level: as begun with."),
+    "drag.c_sd": _positive(0.7, "1", "Its relative 1 sigma, log-normal."),
+    "drag.offset_sd": _positive(0.1, "m/s^2", "1 sigma of what the thrust's axis is askew to the accelerometer's: 0.1 is 0.6 deg."),
+    "timeout.air": _positive(10.0, "s", "The same for measurements of the air."),
+    "timeout.attitude": _positive(10.0, "s", "The same for a told attitude."),
     "timeout.gnss": _positive(7.0, "s", "After this long without a fix that passes, GNSS is let in again by force, at the gate's edge."),
     "timeout.barometer": _positive(7.0, "s", "The same for the barometer."),
     "timeout.magnetometer": _positive(10.0, "s", "The same for the magnetometer."),
@@ -177,6 +239,10 @@ KEYS: dict[str, Key] = {
     "init.velocity": _positive(0.3, "m/s", "Least 1 sigma of velocity."),
     "init.baro_bias": _positive(3.0, "m", "1 sigma of the barometer offset."),
     "init.mag_offset": _positive(5.0, "uT", "1 sigma of the magnetometer's offset, where it is estimated."),
+    "init.wind": _positive(5.0, "m/s", "1 sigma of each component of the horizontal wind, which begins at none."),
+    "init.wind_d": _positive(1.0, "m/s", "1 sigma of the vertical wind."),
+    "init.airspeed_scale": _positive(0.1, "1", "Relative 1 sigma of the airspeed's scale."),
+    "init.vane": _positive(3.0 * DEG, "rad", "1 sigma of a vane's offset."),
     "rest.gyro": _positive(0.02, "rad/s", "At rest the rate's standard deviation over a second is below this."),
     "rest.accel": _positive(0.3, "m/s^2", "At rest the standard deviation of |f| over a second is below this."),
     "rest.gravity": _positive(0.5, "m/s^2", "At rest mean |f| differs from gravity by less than this."),
@@ -258,16 +324,27 @@ GROUPS: dict[str, tuple[str, ...]] = {
 }
 
 _TWO_STAGE = tuple(key for key in KEYS if key.startswith("two_stage."))
+#: What only an estimator with wind has.
+_AIR = tuple(
+    key for key in KEYS
+    if not key.startswith("delay.") and (key.startswith(("air.", "drag.", "wind.")) or key.partition(".")[2] in (
+        "wind", "wind_d", "wind_mean", "air_walk", "airspeed", "aoa", "sideslip", "airdata_time", "no_sideslip", "drag", "drag_time", "given_wind",
+        "air", "airdata", "vanes", "airspeed_scale", "vane",
+    ))
+)  # fmt: skip
+_NO_AIR: dict[str, Value] = {"aid.drag": "off", "aid.airdata": "off", "aid.vanes": "off", "aid.no_sideslip": "off", "aid.wind": "off"}
 #: What an estimator sets differently from the defaults above.
 _OVERRIDES: dict[str, dict[str, Value]] = {
     "navigator": {},
     "ahrs": {
         "aid.gnss": "off", "aid.barometer": "off", "aid.fake_velocity": "on", "aid.fake_position": "off", "baro.offset": "off",
+        **_NO_AIR,
     },
     "two-stage": {
         "aid.magnetometer": "orthonormal", "aid.barometer": "off", "baro.offset": "off", "aid.fake_velocity": "off",
         "aid.zero_velocity": "off", "aid.zero_rate": "off", "aid.yaw_bank": "off", "aid.compass_watch": "off",
         "aid.motor_field": "off", "two_stage.radial": 0.05, "two_stage.memory": 10.0,
+        **_NO_AIR,
     },
 }  # fmt: skip
 _NO_GATE = 1e6
@@ -286,8 +363,9 @@ _PRESET_OVERRIDES["two-stage", "as-printed"] = _PRESET_OVERRIDES["two-stage", "a
 #: Keys that an estimator does not have: changing them would change nothing, or make it another one.
 _FIXED: dict[str, tuple[str, ...]] = {
     "navigator": _TWO_STAGE,
-    "ahrs": (*_OVERRIDES["ahrs"], *_TWO_STAGE),
+    "ahrs": (*_OVERRIDES["ahrs"], *_TWO_STAGE, *_AIR),
     "two-stage": (
+        *_AIR,
         "aid.barometer",
         "baro.offset",
         "aid.fake_velocity",

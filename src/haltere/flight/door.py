@@ -17,6 +17,7 @@ from haltere.errors import HaltereError
 from haltere.flight import moving
 from haltere.flight.agreement import judge, option
 from haltere.flight.corrections import mounted
+from haltere.flight.door_air import RULES
 from haltere.flight.field import decimal_year, earth_field
 from haltere.flight.log import FlightLog, Stream
 from haltere.flight.names import nearest_column, nearest_stream
@@ -30,7 +31,7 @@ RATE_MIN, RATE_POOR, RATE_HIGH = 10.0, 50.0, 40000.0
 #: No flight has a hole of this many seconds.
 DAY = 86400.0
 #: What estimators read.
-READ = ("imu", "magnetometer", "gnss", "barometer", "power")
+READ = ("imu", "magnetometer", "gnss", "barometer", "power", "rotors", "airdata", "wind", "attitude")
 IMU = ("gyro_x", "gyro_y", "gyro_z", "accel_x", "accel_y", "accel_z")
 #: No small gyro or accelerometer measures more [rad/s, m/s^2].
 RATE_MAX, FORCE_MAX = 100.0, 500.0
@@ -85,7 +86,7 @@ def check(flight: FlightLog, *, upright: bool = True, given: Mapping[str, Any] |
     _check_names(flight, out)
     _check_types(flight)
     _check_imu(flight, out, upright, given or {})
-    rules = (("magnetometer", _check_magnetometer), ("gnss", _check_gnss), ("barometer", _check_barometer))
+    rules = (("magnetometer", _check_magnetometer), ("gnss", _check_gnss), ("barometer", _check_barometer), *RULES)
     for name, rule in rules:
         stream = flight.get(name)
         if stream is None:
@@ -94,7 +95,8 @@ def check(flight: FlightLog, *, upright: bool = True, given: Mapping[str, Any] |
         if n == 0:
             out.warnings.append(f"{name}: the log has the stream, but not one sample in it")
             continue
-        cleaned = _check_held(out, name, rule(out, _clean_time(out, name, stream)))
+        cleaned = rule(out, _clean_time(out, name, stream))
+        cleaned = cleaned if name in ("wind", "rotors") else _check_held(out, name, cleaned)
         if len(cleaned):
             out.streams[name] = cleaned
             _check_clock(out, name, cleaned)

@@ -44,6 +44,8 @@ CORE = 15
 IMU_CAPACITY = 512
 MEASUREMENT_CAPACITY = 128
 EVENT_CAPACITY = 32
+#: Sensors whose measurements are queued.
+N_QUEUES = 10
 #: Tenths of a second that the compass watch looks back, in a plain number: it is a modulus.
 COMPASS_BINS = constant(128)
 
@@ -111,6 +113,8 @@ ALIGNMENT = _record(
     ("t_baro", "f8"),
     ("n_baro", "f8"),
     ("kind", "i8"),
+    ("given", "f8", 4),  # attitude told from outside, and when
+    ("t_given", "f8"),
 )
 
 #: Bank of yaw hypotheses: states [v_N, v_E, yaw error], covariances, weights, and the velocity increment since the last fix.
@@ -199,6 +203,22 @@ MOTORS = _record(
     ("sd", "f8"),
 )
 
+#: What the air aids remember: the last stretch of specific force in flight, and how the rotors' speed goes with thrust.
+AIR = _record(
+    ("t", "f8"),  # since when it is gathered [s]
+    ("dt", "f8"),
+    ("f", "f8", 3),  # integral of the raw specific force [m/s]
+    ("v", "f8", 3),  # velocity NED [m/s] and attitude at its start
+    ("q", "f8", 4),
+    ("airborne", "i8"),
+    ("level", "f8"),  # height down [m] where it last rested
+    ("t_rest", "f8"),
+    ("t_rotors", "f8"),
+    ("speed", "f8"),  # sum of the rotors' speeds [rad/s]
+    ("ratio", "f8"),  # that over the square root of thrust, slowly followed
+    ("n_ratio", "i8"),
+)
+
 #: ``onset`` and ``threshold`` where there is one, else the time itself and NaN.
 EVENT = _record(("t", "f8"), ("onset", "f8"), ("code", "i8"), ("sensor", "i8"), ("value", "f8"), ("threshold", "f8"), ("detail", "i8"))
 
@@ -211,6 +231,10 @@ STAGE = _record(
     ("ba", "f8", 3),
     ("baro", "f8", (0,)),
     ("mag", "f8", (0,)),
+    ("wind", "f8", (0,)),
+    ("drag", "f8", (0,)),
+    ("steady", "f8", (0,)),
+    ("vane", "f8", (0,)),
     ("P", "f8", (CORE, CORE)),
     ("dx", "f8", CORE),
     ("u", "f8", CORE),
@@ -229,16 +253,22 @@ PARAMETERS = np.dtype(
             "noise_gnss_velocity noise_gnss_position noise_gnss_altitude noise_gnss_velocity_min noise_gnss_position_min "
             "noise_barometer noise_magnetometer noise_field noise_field_time noise_mag_offset "
             "noise_zero_velocity noise_zero_rate noise_fake_position noise_fake_position_rest noise_fake_velocity "
-            "gate_gnss gate_barometer gate_magnetometer gate_zero_velocity gate_zero_rate "
+            "noise_wind noise_wind_d noise_wind_mean noise_air_walk wind_gust wind_turbulence wind_gust_time  noise_airspeed noise_aoa noise_sideslip noise_no_sideslip noise_drag noise_given_wind "
+            "noise_attitude noise_attitude_yaw noise_attitude_time noise_drag_time noise_airdata_time "
+            "gate_gnss gate_barometer gate_magnetometer gate_zero_velocity gate_zero_rate gate_air gate_attitude "
             "delay_gnss_velocity delay_gnss_position delay_barometer delay_magnetometer delay_power "
+            "delay_rotors delay_airdata delay_wind delay_attitude "
             "aid_gnss aid_barometer aid_magnetometer aid_zero_velocity aid_zero_rate aid_fake_position aid_fake_velocity aid_yaw_bank "
-            "aid_compass_watch aid_motor_field "
-            "timeout_gnss timeout_barometer timeout_magnetometer timeout_imu "
+            "aid_compass_watch aid_motor_field aid_airdata aid_no_sideslip aid_drag aid_wind aid_attitude "
+            "air_moves air_density air_airspeed_min "
+            "drag_mu drag_mu_sd drag_c drag_c_sd drag_offset_sd "
+            "timeout_gnss timeout_barometer timeout_magnetometer timeout_air timeout_attitude timeout_imu "
             "arm_gnss_x arm_gnss_y arm_gnss_z "
             "robust_innovation robust_strength robust_dip robust_heading robust_calibration "
             "field_declination field_dip field_strength field_tolerance_strength field_tolerance_dip "
             "init_tilt_rest init_tilt_motion init_yaw_compass init_yaw_unknown init_gyro_bias_rest init_gyro_bias "
             "init_accel_bias init_velocity init_baro_bias init_mag_offset "
+            "init_wind init_wind_d init_airspeed_scale init_vane "
             "rest_gyro rest_accel rest_gravity "
             "two_stage_tolerance two_stage_k1 two_stage_k2 two_stage_robust two_stage_index two_stage_innovation "
             "two_stage_radial two_stage_memory "
@@ -251,7 +281,7 @@ PARAMETERS = np.dtype(
 
 
 @cache
-def layout(baro: int = 0, mag: int = 0, stages: int = 0) -> np.dtype[np.void]:
+def layout(baro: int = 0, mag: int = 0, stages: int = 0, wind: int = 0, drag: int = 0, vane: int = 0) -> np.dtype[np.void]:
     """State record type.
 
     Parameters
@@ -262,13 +292,19 @@ def layout(baro: int = 0, mag: int = 0, stages: int = 0) -> np.dtype[np.void]:
         3 with the offset of the magnetometer as states, else 0.
     stages
         1 with a first stage beside the main state (`two-stage`), else 0.
+    wind
+        2 with the horizontal wind as states, 3 with all of it, else 0.
+    drag
+        4 with the drag of a multirotor as states, and the wind that gusts return to, else 0; it needs a wind of 2.
+    vane
+        1 with the scale of the airspeed as a state, 3 with the offsets of both vanes too, else 0.
 
     Returns
     -------
     numpy.dtype
         Nominal state, covariance ``P`` (n, n), scratch, queues, monitors and counters: the whole memory of a filter.
     """
-    n = CORE + baro + mag
+    n = CORE + baro + mag + wind + (drag + 2 if drag else 0) + vane
     return np.dtype(
         [
             ("t", "f8"),
@@ -279,6 +315,10 @@ def layout(baro: int = 0, mag: int = 0, stages: int = 0) -> np.dtype[np.void]:
             ("ba", "f8", 3),
             ("baro", "f8", (baro,)),
             ("mag", "f8", (mag,)),  # offset of the magnetometer in the body frame [uT]
+            ("wind", "f8", (wind,)),  # NED [m/s]; in a layout with drag its force at hover [m/s^2], see `aids.air`
+            ("drag", "f8", (drag,)),  # ln mu [1/s], ln c [1/m], offset of the thrust's axis along x and y [m/s^2]
+            ("steady", "f8", (2 if drag else 0,)),  # what the wind returns to after gusts, likewise
+            ("vane", "f8", (vane,)),  # ln of the airspeed's scale, offsets of angle of attack and sideslip [rad]
             ("P", "f8", (n, n)),
             ("dx", "f8", n),
             ("u", "f8", n),
@@ -314,19 +354,20 @@ def layout(baro: int = 0, mag: int = 0, stages: int = 0) -> np.dtype[np.void]:
             ("n_events", "i8"),
             ("n_events_lost", "i8"),
             ("event", EVENT, (EVENT_CAPACITY,)),
-            ("aid", AID_STATE, (9,)),
+            ("aid", AID_STATE, (16,)),
             ("rest", REST),
             ("yaw", YAW_BANK),
             ("compass", COMPASS),
             ("motors", MOTORS),
+            ("air", AIR),
             ("align", ALIGNMENT),
             ("imu_head", "i8"),
             ("imu_n", "i8"),
             ("imu", IMU_SAMPLE, (IMU_CAPACITY,)),
             ("a", STAGE, (stages,)),
-            ("ring_head", "i8", 5),
-            ("ring_n", "i8", 5),
-            ("ring", MEASUREMENT, (5, MEASUREMENT_CAPACITY)),
+            ("ring_head", "i8", N_QUEUES),
+            ("ring_n", "i8", N_QUEUES),
+            ("ring", MEASUREMENT, (N_QUEUES, MEASUREMENT_CAPACITY)),
         ],
         align=True,
     )

@@ -5,13 +5,15 @@ Error state: q_true = q ⊗ δq(δθ) (body), everything else true minus estimat
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 from haltere._jit import jit
 from haltere.core.rotation import Mat, Vec, cross, dcm, dot, mat_vec, quat_from_rotvec, quat_mul, quat_unit, rotvec_dcm
 from haltere.filter.update import symmetrise
+from haltere.strapdown.optional import add_optional
 
-__all__ = ["inject", "left_F", "mechanise", "predict", "propagate", "transition", "turn"]
+__all__ = ["gust_keeps", "inject", "left_F", "mechanise", "predict", "propagate", "transition", "turn"]
 
 
 @jit
@@ -179,6 +181,8 @@ def propagate(s: Any, prm: Any, C: Mat, D: Mat, A: Mat, B: Mat, dt: float) -> No
     o = 15 + len(s.baro)
     for i in range(len(s.mag)):
         P[o + i, o + i] += prm.noise_mag_offset * prm.noise_mag_offset * dt
+    if len(s.wind) > 0:
+        blow(s, prm, o + len(s.mag), dt)
     if dt > 0.02:  # below that the off-diagonal blocks are lost in the noise (theory-amendments.md §8)
         for i in range(3):
             c = -0.5 * qbg * dt * dt
@@ -191,6 +195,46 @@ def propagate(s: Any, prm: Any, C: Mat, D: Mat, A: Mat, B: Mat, dt: float) -> No
                 c = -0.5 * qba * dt * dt * C[i][j]
                 P[3 + i, 12 + j] += c
                 P[12 + j, 3 + i] += c
+
+
+@jit
+def gust_keeps(prm: Any, dt: float) -> float:
+    """What is left of a gust after ``dt`` seconds."""
+    return math.exp(-dt / prm.wind_gust_time)
+
+
+@jit
+def blow(s: Any, prm: Any, o: int, dt: float) -> None:
+    """Advance wind and coefficients of the air, from error state ``o`` on.
+
+    A wind W of its own walks. One that drag shows is gusts about a slow mean, dA = -(A - Ā) dt/τ + noise, both as the specific force on a
+    vehicle at hover, A = µW + c|W|W (see `haltere.aids.air`), the noise of W times µ + 2c|W|: for a wind that only walked, drag that follows the vehicle's motion would look like wind that returns, and µ would be found wrong
+    (theory-amendments.md §2).
+    """
+    P, n = s.P, s.P.shape[0]
+    if len(s.drag) == 0:
+        for i in range(len(s.wind)):
+            walk = prm.noise_wind if i < 2 else prm.noise_wind_d
+            P[o + i, o + i] += walk * walk * dt
+    first = o + len(s.wind)
+    if len(s.drag) > 0:
+        m, mu, keep = first + len(s.drag), math.exp(s.drag[0]), gust_keeps(prm, dt)
+        for i in range(2):
+            s.wind[i] = keep * s.wind[i] + (1.0 - keep) * s.steady[i]
+            for j in range(n):
+                P[o + i, j] = keep * P[o + i, j] + (1.0 - keep) * P[m + i, j]
+        for j in range(n):
+            for i in range(2):
+                P[j, o + i] = keep * P[j, o + i] + (1.0 - keep) * P[j, m + i]
+        root = math.sqrt(mu * mu + 4.0 * math.exp(s.drag[1]) * math.sqrt(s.steady[0] * s.steady[0] + s.steady[1] * s.steady[1]))
+        speed = (root - mu) / (2.0 * math.exp(s.drag[1]))  # of the mean wind; root is what a change of wind is multiplied with there
+        gust, walk = root * (prm.wind_gust + prm.wind_turbulence * speed), root * prm.noise_wind_mean
+        for i in range(2):
+            P[o + i, o + i] += gust * gust * (1.0 - keep * keep)
+            P[m + i, m + i] += walk * walk * dt
+    for i in range(first, n):
+        if i < first + len(s.drag) or i >= first + len(s.drag) + len(s.steady):
+            P[i, i] += prm.noise_air_walk * prm.noise_air_walk * dt
 
 
 @jit
@@ -208,11 +252,7 @@ def inject(s: Any) -> None:
         s.p[i] += dx[6 + i]
         s.bg[i] += dx[9 + i]
         s.ba[i] += dx[12 + i]
-    for i in range(len(s.baro)):
-        s.baro[i] += dx[15 + i]
-    o = 15 + len(s.baro)
-    for i in range(len(s.mag)):
-        s.mag[i] += dx[o + i]
+    add_optional(s, dx, 15)
     for j in range(n):
         c = cross(t, (P[0, j], P[1, j], P[2, j]))
         P[0, j] -= 0.5 * c[0]
