@@ -199,8 +199,9 @@ def _calibrate_magnetometer(
 @app.command(
     "identify",
     short_help="The vehicle's drag from flights in wind.",
-    help="Identify a vehicle from its flights. --drag: the drag that PX4's and ArduPilot's wind estimation needs (EKF2_MCOEF, EKF2_BCOEF_X/Y, "
-    "EK3_DRAG_*) and haltere's own, jointly with the wind, with its uncertainty, ready to paste. Refused where the flights do not tell it.",
+    help="Identify a vehicle from its flights. --drag: the drag that the wind estimation of PX4 and ArduPilot needs (EKF2_MCOEF, "
+    "EKF2_BCOEF_X/Y, EK3_DRAG_*) and haltere's own, jointly with the wind, with its uncertainty, ready to paste. Refused where the flights "
+    "do not tell it.",
 )
 def _identify(
     logs: Annotated[list[Path], typer.Argument(metavar="LOG...", help="Logs or flight folders of one vehicle.", show_default=False)],
@@ -225,9 +226,7 @@ def _identify(
 
     if not drag:
         raise UsageError("what to identify: --drag", "nothing", "identify")
-    identify_drag(
-        logs, config=config, assignments=set_ or [], out=out, columns=columns, column=column, json=json, show=open_
-    )
+    identify_drag(logs, config=config, assignments=set_ or [], out=out, columns=columns, column=column, json=json, show=open_)
 
 
 @app.command(

@@ -121,9 +121,9 @@ def _lines(d: DragIdentification, folder: Path) -> list[str]:
             f"wind of {m.name}: {speed:.1f} m/s towards {toward:.0f} deg (n {part.wind[0]:.2f} ± {sd[0]:.2g}, e {part.wind[1]:.2f} ± "
             f"{sd[1]:.2g}), gusts {part.sizes[0]:.2g} m/s lasting {part.sizes[1]:.2g} s"
         )
-    for form, f in d.fits.items():
-        values = ", ".join(f"{n} {v:.4g} ± {s:.2g} {u}" for n, v, s, u in zip(FORMS[form].names, f.values, f.sd, FORMS[form].units, strict=True))
-        out.append(f"model {form}: {values}; BIC {f.bic - best:+.0f}")
+    for name, f in d.fits.items():
+        rows = zip(FORMS[name].names, f.values, f.sd, FORMS[name].units, strict=True)
+        out.append(f"model {name}: {', '.join(f'{n} {v:.4g} ± {s:.2g} {u}' for n, v, s, u in rows)}; BIC {f.bic - best:+.0f}")
     for title, values, sds, form in (
         ("PX4", px4_parameters(d), parameter_sd(d, "px4"), "  param set {name} {value}"),
         ("ArduPilot", ardupilot_parameters(d), parameter_sd(d, "ardupilot"), "  {name},{value}"),

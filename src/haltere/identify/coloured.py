@@ -75,4 +75,3 @@ class Coloured:
         b = np.einsum("kmi,kmp->kip", self.H, X).reshape(n * l, p) / self.noise
         g = cho_solve_banded((self._factor, True), b, check_finite=False).reshape(n, l, p)
         return np.asarray((X - np.einsum("kmi,kip->kmp", self.H, g)) / self.noise)
-

@@ -217,10 +217,9 @@ def _judge(out: DragIdentification) -> str:
                 f"{m.name}: mean wind is known to {float(np.max(sd)):.1f} m/s only: it is not told from offsets of thrust axis and "
                 "accelerometer where the nose hardly turns"
             )
-        if part.wind_path.size and float(np.max(np.abs(part.rest[:2]))) > 0.4:
-            out.notes.append(f"{m.name}: offset of {float(np.max(np.abs(part.rest[:2]))):.2f} m/s^2 across the thrust axis, more than usual")
+        most = float(np.max(np.abs(part.rest[:2])))
+        if most > 0.4:
+            out.notes.append(f"{m.name}: offset of {most:.2f} m/s^2 across the thrust axis, more than usual")
     if base.inflation > 1.5:
-        out.notes.append(
-            f"stretches of the flights differ more than gusts explain: 1 sigma was raised by {math.sqrt(base.inflation):.1f}"
-        )
+        out.notes.append(f"stretches of the flights differ more than gusts explain: 1 sigma was raised by {math.sqrt(base.inflation):.1f}")
     return ""

@@ -2,8 +2,8 @@
 
 The force across the thrust axis is ``f = model(p, C_nbᵀ(v - W - g), T, ρ) + Z z + e + white``: a mean wind W a flight, gusts g
 (exponentially correlated in NED), what the model leaves e (exponentially correlated in the body), and what else is in the force, linear:
-an offset of either axis, its part that goes with the rate (rotors above or below the centre of gravity), the IMU's arm. Parameters are found by iterated
-generalised least squares about the mean wind; the sizes and times of g, e and the noise by restricted maximum likelihood.
+an offset of either axis, its part that goes with the rate (rotors above or below the centre of gravity), the IMU's arm. Parameters are
+found by iterated generalised least squares about the mean wind; sizes and times of g, e and the noise by restricted maximum likelihood.
 """
 
 from __future__ import annotations
@@ -71,7 +71,7 @@ class Part:
     rest: FloatArray = field(default_factory=lambda: np.zeros(N_ELSE))
     wind: FloatArray = field(default_factory=lambda: np.zeros(2))
     paths: FloatArray = field(default_factory=lambda: np.zeros((0, 4)))
-    colour: FloatArray = field(default_factory=lambda: COLOUR.copy())
+    colour: FloatArray = field(default_factory=COLOUR.copy)
     residual: FloatArray = field(default_factory=lambda: np.zeros((0, 2)))
 
     @property
@@ -147,7 +147,6 @@ class _Linear:
 
 def _linear(part: Part, form: str, p: FloatArray) -> _Linear:
     s = part.samples
-    n = len(s.t)
     # About the mean wind: a slope taken at the most likely gusts would know of the residuals, and the drag would come out too large.
     v = np.einsum("kji,kj->ki", s.C_nb, s.vel_n - np.r_[part.wind, 0.0])
     by_p, by_v = drag_slopes(form, p, v, load_of(form, s), s.density)
@@ -160,7 +159,10 @@ def _linear(part: Part, form: str, p: FloatArray) -> _Linear:
 
 
 def _rest(s: Samples) -> FloatArray:
-    """Columns (n, 2, 7) of what else is in the force along x and y: offsets, with pitch and roll rate, with the arm (ω̇ × r + ω × (ω × r))."""
+    """Columns (n, 2, 7) of what else is in the force along x and y: offsets, with pitch and roll rate, with the arm r.
+
+    The arm gives ω̇ × r + ω × (ω × r).
+    """
     Z = np.zeros((len(s.t), 2, N_ELSE))
     Z[:, 0, 0] = Z[:, 1, 1] = 1.0
     p, q, r = s.gyro_b.T
@@ -296,13 +298,11 @@ def _normal(
     return S, s
 
 
-def _result(
-    form: str, p: FloatArray, free: BoolArray, parts: list[Part], precision: FloatArray, steps: int, done: bool
-) -> Result:
+def _result(form: str, p: FloatArray, free: BoolArray, parts: list[Part], precision: FloatArray, steps: int, done: bool) -> Result:
     k = len(p)
     lin = [_linear(part, form, p) for part in parts]
     S, _ = _normal(lin, p, parts, np.zeros(k + N_OWN), precision, k)
-    full = np.linalg.inv(S)
+    full: FloatArray = np.asarray(np.linalg.inv(S), dtype=np.float64)
     inflation = _inflation(full, lin, parts, free)
     full *= inflation
     log_sd = float(np.sqrt(full[0, 0]))
@@ -335,8 +335,8 @@ def _inflation(full: FloatArray, lin: list[_Linear], parts: list[Part], free: Bo
         return 1.0
     G = np.array(gradients)
     spread = full @ (G.T @ G) @ full * n / max(n - 1.0, 1.0)
-    ratio = np.diag(spread)[:k][free] / np.diag(full)[:k][free]
-    return float(max(1.0, np.mean(ratio)))
+    ratio = float(np.mean(np.diag(spread)[:k][free] / np.diag(full)[:k][free]))
+    return max(1.0, ratio)
 
 
 def without_wind(form: str, flights: list[Samples]) -> FloatArray:

@@ -41,8 +41,9 @@ class Form:
 
 #: Models by name. Force per mass [m/s^2] along body x and y, with the air velocity v_a [m/s], its length over all three axes |v_a|, thrust
 #: per mass T and air density ρ. The drag of a rotor goes with its speed, which goes with the root of its thrust where nothing blows
-#: through it along its axis: ``rotors`` knows the speeds, ``haltere`` takes that root, the autopilots a constant. PX4: src/modules/ekf2/EKF/aid_sources/drag/drag_fusion.cpp (00c59fa); ArduPilot:
-#: libraries/AP_NavEKF3/AP_NavEKF3_AirDataFusion.cpp (031de06), each with the density as that code computes it.
+#: through it along its axis: ``rotors`` knows the speeds, ``haltere`` takes that root, the autopilots a constant. PX4:
+#: src/modules/ekf2/EKF/aid_sources/drag/drag_fusion.cpp (00c59fa); ArduPilot: libraries/AP_NavEKF3/AP_NavEKF3_AirDataFusion.cpp
+#: (031de06), each with the density as that code computes it.
 FORMS: dict[str, Form] = {
     "haltere": Form(
         ("mu", "c"), ("1/s", "1/m"), (0.3, 0.0), (0.7, 0.05),

@@ -26,6 +26,8 @@ BoolArray = NDArray[np.bool_]
 
 #: Length of the windows over which drag is looked at [s], and the least time in the air that anything is fitted to [s].
 WINDOW, LEAST = 0.1, 10.0
+#: The navigator must not know of drag what is to be found.
+APART = {"aid.drag": "off", "aid.wind": "off"}
 #: Longest interval of rotor telemetry that tells the speed between samples [s].
 SLOW = 0.15
 #: In the air: this far above where it last stood [m] or this fast [m/s]; and so long away from standing [s].
@@ -96,7 +98,9 @@ class Samples:
         return np.asarray(-self.force_b[:, 2])
 
 
-def motion(flight: FlightLog, config: Config | Mapping[str, Any] | str | Path | None = None, set: Mapping[str, Any] | None = None) -> Motion:
+def motion(
+    flight: FlightLog, config: Config | Mapping[str, Any] | str | Path | None = None, set: Mapping[str, Any] | None = None
+) -> Motion:
     """Smooth a flight with the navigator and take from it what identification needs.
 
     Raises
@@ -104,7 +108,7 @@ def motion(flight: FlightLog, config: Config | Mapping[str, Any] | str | Path | 
     HaltereError
         The log cannot be navigated on, or was never in the air long enough.
     """
-    solution = run(flight, "navigator", config=config, set=set, smooth=True, scored=False)
+    solution = run(flight, "navigator", config=config, set={**(set or {}), **APART}, smooth=True, scored=False)
     s = solution.smoothed
     if s is None:  # cannot be: it was asked for
         raise HaltereError("a smoothed run", "none", flight.meta.name)
@@ -153,9 +157,7 @@ def _in_air(solution: Solution, t: FloatArray, vel: FloatArray, pos: FloatArray)
     return np.asarray(~rest & (above | (np.linalg.norm(vel, axis=1) > SPEED)))
 
 
-def air_density(
-    flight: FlightLog, config: Config, t: FloatArray, height: FloatArray, notes: list[str]
-) -> tuple[FloatArray, float]:
+def air_density(flight: FlightLog, config: Config, t: FloatArray, height: FloatArray, notes: list[str]) -> tuple[FloatArray, float]:
     """Air density (n,) [kg/m^3] and its relative 1 sigma, from static pressure and ``baro.temperature``, else the standard atmosphere.
 
     ``height`` is above the origin [m]. The barometer's own temperature is that of its die and is not used.
@@ -182,8 +184,8 @@ def air_density(
     sd = 0.005 if not math.isnan(said) else TEMPERATURE_SD / 288.0
     if math.isnan(said):
         notes.append(
-            f"air temperature is not known: the standard atmosphere's is taken ({float(np.mean(temperature)) - 273.15:.0f} degC at this height, "
-            f"1 sigma {TEMPERATURE_SD:g} K assumed; set baro.temperature [K])"
+            f"air temperature is not known: the standard atmosphere's is taken ({float(np.mean(temperature)) - 273.15:.0f} degC at this "
+            f"height, 1 sigma {TEMPERATURE_SD:g} K assumed; set baro.temperature [K])"
         )
     if not known:
         notes.append(f"neither pressure nor height above sea level is known: air density {RHO0} kg/m^3 is assumed, 1 sigma 10 %")

@@ -1,4 +1,4 @@
-"""One model of drag in the terms of another: the parameters with which that comes nearest over the air velocities flown. It fits no data."""
+"""One model of drag in the terms of another: with which parameters that comes nearest over the air velocities flown. It fits no data."""
 
 from __future__ import annotations
 

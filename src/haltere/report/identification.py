@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 
 import numpy as np
@@ -92,7 +93,7 @@ def _curve(d: DragIdentification) -> Section:
     speed, force = np.concatenate(speeds), np.concatenate(forces)
     edges = np.arange(0.5, max(float(np.max(speed)), 1.5) + 0.5, 0.5)
     at, mean = [], []
-    for low, high in zip(edges[:-1], edges[1:], strict=True):
+    for low, high in itertools.pairwise(edges):
         inside = (speed >= low) & (speed < high)
         if inside.sum() >= 5:
             at.append(0.5 * (low + high))
@@ -108,8 +109,8 @@ def _curve(d: DragIdentification) -> Section:
     y = -drag_force("px4", d.still["px4"], v, np.full(len(x), float(np.mean(loads))), rho)[:, 0]
     grid.line(0, "PX4's formula, air taken for still", "refused", x, y, dash="dot", hover="%{y:.3~g} m/s²")
     note = (
-        "Force per mass against the velocity through the air, offsets taken off, with the most likely wind. The dotted line is what comes out "
-        "of the same flights where the air is taken for still."
+        "Force per mass against the velocity through the air, offsets taken off, with the most likely wind. The dotted line is what comes "
+        "out of the same flights where the air is taken for still."
     )
     return Section("curve", "Drag", note, [grid.figure()])
 
@@ -130,8 +131,8 @@ def _flight(d: DragIdentification, k: int, pool: Pool) -> Section:
     noise = float(np.sqrt(np.mean((s.force_b[:, :2] - predicted) ** 2)))
     plain = float(np.sqrt(np.mean((s.force_b[:, :2] - steady) ** 2)))
     note = (
-        f"Means of 0.1 s in the air. What is left: {noise:.2g} m/s² (rms) with the most likely gusts, {plain:.2g} m/s² with the mean wind alone. "
-        "The prediction with gusts has seen the measurement."
+        f"Means of 0.1 s in the air. What is left: {noise:.2g} m/s² (rms) with the most likely gusts, {plain:.2g} m/s² with the mean wind "
+        "alone. The prediction with gusts has seen the measurement."
     )
     return Section(f"flight{k}", d.motions[k].name if len(d.flights) > 1 else "Flight", note, [panels.figure()])
 
@@ -141,13 +142,12 @@ def _winds(d: DragIdentification) -> Section:
     for k, (m, part) in enumerate(zip(d.motions, d.base.parts, strict=True)):
         sd = d.base.part_sd(k)
         speed, toward = math.hypot(*part.wind), math.degrees(math.atan2(part.wind[1], part.wind[0])) % 360.0
-        rows.append((
-            escape(m.name), number(speed), f"{toward:.0f}", f"{(toward + 180.0) % 360.0:.0f}",
-            f"{number(float(part.wind[0]))} ± {number(float(sd[-2]), 2)}", f"{number(float(part.wind[1]))} ± {number(float(sd[-1]), 2)}",
-            f"{number(float(part.sizes[0]), 2)} in {number(float(part.sizes[1]), 2)} s",
-            f"{number(float(part.rest[0]), 2)} ± {number(float(sd[0]), 2)}", f"{number(float(part.rest[1]), 2)} ± {number(float(sd[1]), 2)}",
-        ))  # fmt: skip
-    heads = ("flight", "wind [m/s]", "to [deg]", "from [deg]", "north [m/s]", "east [m/s]", "gusts [m/s]", "offset x [m/s²]", "offset y [m/s²]")
+        found = [
+            f"{number(float(v))} ± {number(float(s), 2)}" for v, s in zip(np.r_[part.wind, part.rest[:2]], sd[[-2, -1, 0, 1]], strict=True)
+        ]
+        gusts = f"{number(float(part.sizes[0]), 2)} in {number(float(part.sizes[1]), 2)} s"
+        rows.append((escape(m.name), number(speed), f"{toward:.0f}", f"{(toward + 180.0) % 360.0:.0f}", *found, gusts))
+    heads = ("flight", "wind [m/s]", "to [deg]", "from [deg]", "north", "east", "offset x [m/s²]", "offset y [m/s²]", "gusts [m/s]")
     section = Section("winds", "Wind and offsets")
     section.note = "Means over the flight. Offsets are thrust axis and accelerometer bias together."
     section.after = table(heads, rows)
@@ -167,16 +167,16 @@ def _models(d: DragIdentification) -> Section:
     ]  # fmt: skip
     section = Section("models", "Models")
     section.note = (
-        "Each fitted by itself, with its own wind and colour of the noise. BIC, of whitened residuals, above the best: 10 is strong evidence, "
-        "the more the worse. The parameters to paste are not these of px4 and ardupilot but those with which their formulas come nearest to "
-        f"the drag of {d.base.form}."
+        "Each fitted by itself, with its own wind and colour of the noise. BIC, of whitened residuals, above the best: 10 is strong evidence. "
+        "The parameters to paste are not these of px4 and ardupilot but those with which their formulas come nearest "
+        f"to the drag of {d.base.form}."
     )
     section.after = table(("model", "formula ", "parameters ", "BIC", "air taken for still"), rows)
     return section
 
 
-def _block(parameters: dict[str, float], sd: dict[str, float], form: str, remark: str) -> str:
-    lines = [form.format(name=n, value=f"{v:.4g}") + (f"{remark}{sd[n]:.2g}" if n in sd else "") for n, v in parameters.items()]
+def _block(parameters: dict[str, float], sd: dict[str, float], form: str) -> str:
+    lines = [form.format(name=n, value=f"{v:.4g}") + (f"    # 1 sigma {sd[n]:.2g}" if n in sd else "") for n, v in parameters.items()]
     return f'<pre class="command">{escape(chr(10).join(lines))}</pre>'
 
 
@@ -186,9 +186,10 @@ def _paste(d: DragIdentification) -> Section:
         section.after = "<p>Nothing: the flights do not tell the drag.</p>"
         return section
     said = "".join(f"<li>{escape(r)}</li>" for r in remarks(d))
+    px4 = _block(px4_parameters(d), parameter_sd(d, "px4"), "param set {name} {value}")
+    ardupilot = _block(ardupilot_parameters(d), parameter_sd(d, "ardupilot"), "{name},{value}")
     section.after = (
-        f"<ul>{said}</ul><h3>PX4 (console)</h3>{_block(px4_parameters(d), parameter_sd(d, 'px4'), 'param set {name} {value}', '    # 1 sigma ')}"
-        f"<h3>ArduPilot (parameter file)</h3>{_block(ardupilot_parameters(d), parameter_sd(d, 'ardupilot'), '{name},{value}', '    # 1 sigma ')}"
+        f"<ul>{said}</ul><h3>PX4 (console)</h3>{px4}<h3>ArduPilot (parameter file)</h3>{ardupilot}"
         f'<h3>haltere (drag.toml)</h3><pre class="command">{escape(to_toml(d))}</pre>'
     )
     return section
@@ -198,8 +199,8 @@ def _done(d: DragIdentification, command: str | None) -> Section:
     section = Section("done", "How it was made")
     seconds = sum(float(s.t[-1] - s.t[0]) for s in d.flights)
     section.after = (
-        f"<p>{sum(len(s.t) for s in d.flights)} windows over {seconds:.0f} s in the air; air density {number(d.density, 4)} kg/m³, known to "
-        f"{100.0 * d.density_sd:.1f} % (1σ). Motion from navigator, smoothed; the autopilot's own solution was not used.</p>"
+        f"<p>{sum(len(s.t) for s in d.flights)} windows over {seconds:.0f} s in the air; air density {number(d.density, 4)} kg/m³, known "
+        f"to {100.0 * d.density_sd:.1f} % (1σ). Motion from navigator, smoothed; the autopilot's own solution was not used.</p>"
         + (f'<p>The command that gives this again:</p><pre class="command">{escape(command)}</pre>' if command else "")
     )
     return section
