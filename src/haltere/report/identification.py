@@ -142,9 +142,8 @@ def _winds(d: DragIdentification) -> Section:
     for k, (m, part) in enumerate(zip(d.motions, d.base.parts, strict=True)):
         sd = d.base.part_sd(k)
         speed, toward = math.hypot(*part.wind), math.degrees(math.atan2(part.wind[1], part.wind[0])) % 360.0
-        found = [
-            f"{number(float(v))} ± {number(float(s), 2)}" for v, s in zip(np.r_[part.wind, part.rest[:2]], sd[[-2, -1, 0, 1]], strict=True)
-        ]
+        pairs = zip((*part.wind, *part.rest[:2]), sd[[-2, -1, 0, 1]], strict=True)
+        found = [f"{number(float(v))} ± {number(float(s), 2)}" for v, s in pairs]
         gusts = f"{number(float(part.sizes[0]), 2)} in {number(float(part.sizes[1]), 2)} s"
         rows.append((escape(m.name), number(speed), f"{toward:.0f}", f"{(toward + 180.0) % 360.0:.0f}", *found, gusts))
     heads = ("flight", "wind [m/s]", "to [deg]", "from [deg]", "north", "east", "offset x [m/s²]", "offset y [m/s²]", "gusts [m/s]")
