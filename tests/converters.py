@@ -1,4 +1,7 @@
-"""Small converters of foreign recordings for the tests: PX4-ECL replay, InertialNav, BROAD, ANSFL QDR. Not part of the package."""
+"""Small converters of foreign recordings for the tests: PX4-ECL replay, InertialNav, BROAD, ANSFL QDR. Not part of the package.
+
+Those with air data or a wind mast (UMN Thor, InertialNav TestLog2, WEMUAV) are in ``converters_air.py``.
+"""
 
 from __future__ import annotations
 

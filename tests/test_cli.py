@@ -318,3 +318,21 @@ def test_smooth_writes_a_table_and_says_so(haltere: Caller, log: Path) -> None:
     assert errors["smoothed"]["errors"]["truth"]["roll_deg"]["rms"] < errors["errors"]["truth"]["roll_deg"]["rms"]
     haltere("run", log, "--out", "smooth")  # a later run without it takes the table away
     assert not Path("smooth/smoothed.parquet").exists()
+
+
+# --- a wind told from outside --------------------------------------------------------------------------------------------
+
+
+def test_a_told_wind_is_checked_before_the_log_is_read_and_goes_into_the_command(haltere: Caller, log: Path) -> None:
+    for words in (["--wind", "nowhere.csv"], ["--wind", "fast@270"], ["--wind-sd", "1"], ["--wind", "1,2", "--wind-sd", "0"]):
+        called = haltere("run", "no such log", *words)
+        assert called.status == 2
+        assert one_line(called.err)
+        assert "wind" in called.err
+    called = haltere("run", log, "--wind", "-4,2.5", "--out", "told", "--json")
+    assert called.status == 0
+    summary = json.loads(called.out)
+    assert any("wind told: -4 m/s to north, 2.5 to east" in w for w in summary["warnings"])
+    assert any("not used" in w for w in summary["warnings"])  # this vehicle has neither rotors nor a pitot tube in its log
+    assert "--wind -4,2.5" in Path("told/report.html").read_text(encoding="utf-8")
+    assert "not used" in called.err

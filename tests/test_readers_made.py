@@ -76,6 +76,7 @@ def _copter(path: Path, *, lane: int = 1, origin: bool = True) -> Path:
     log.define("ORGN", "QBLLe", "TimeUS,Type,Lat,Lng,Alt")
     log.define("XKF1", "QBccCffffffccc", "TimeUS,C,Roll,Pitch,Yaw,VN,VE,VD,PN,PE,PD,GX,GY,GZ")
     log.define("XKF2", "QBccccc", "TimeUS,C,AX,AY,AZ,VWN,VWE")
+    log.define("XKV2", "QBff", "TimeUS,C,V22,V23")
     log.define("XKF4", "QBb", "TimeUS,C,PI")
     log.define("XKFS", "QBBBBB", "TimeUS,C,MI,BI,GI,AI")
     log.define("POS", "QLLf", "TimeUS,Lat,Lng,Alt")
@@ -110,6 +111,7 @@ def _copter(path: Path, *, lane: int = 1, origin: bool = True) -> Path:
             for c in range(2):
                 log.put("XKF1", us, c, 1.0 + c, 2.0, 350.0, 3.0, 4.0, 5.0, 6.0 + c, 7.0, 8.0, 0.5, 0.0, -0.5)
                 log.put("XKF2", us, c, 0.01, 0.02, 0.03, 2.0 + c, -1.0)
+                log.put("XKV2", us, c, 0.25 + c, 0.0)
                 log.put("XKF4", us, c, lane)
                 log.put("XKFS", us, c, c, c, 0, 0)
             log.put("POS", us + 300, 47.001, 8.001, 510.0)
@@ -152,7 +154,9 @@ def test_ardupilot_of_today(tmp_path: Path) -> None:
     onboard = flight["onboard"]
     rows = np.isfinite(onboard["q_w"])
     assert set(onboard["pos_n"][rows]) == {7.0}  # lane 1 only
-    assert set(onboard["wind_n"][rows]) == {3.0}
+    assert set(onboard["wind_n"][rows]) == {3.0}  # VWN is the velocity of the air: it blows to
+    np.testing.assert_allclose(onboard["sd_wind_n"][rows], np.sqrt(1.25))
+    assert "sd_wind_e" not in onboard  # no variance is no certainty
     assert onboard["gyro_bias_x"][rows][0] == pytest.approx(np.radians(0.5))
     assert onboard["accel_bias_z"][rows][0] == pytest.approx(0.03)
     want = q_from_euler(*(np.radians([a]) for a in (2.0, 2.0, 350.0)))
@@ -318,6 +322,7 @@ def test_px4_of_today(tmp_path: Path) -> None:
     assert flight.discarded["airdata"] == {"airspeed not of a sensor": 1, "airspeed that the autopilot calls invalid": 1}
     onboard = flight["onboard"]
     assert set(onboard["wind_n"][np.isfinite(onboard["wind_n"])]) == {3.0}
+    assert onboard["sd_wind_e"][np.isfinite(onboard["sd_wind_e"])] == pytest.approx(np.sqrt(0.1))
     # Positions count from the named home: the estimator's origin lies 111 m south of it and 10 m above.
     pos = np.isfinite(onboard["pos_n"])
     assert pos.sum() == 2  # before that the origin was not known

@@ -72,6 +72,7 @@ if TYPE_CHECKING:
     from haltere.estimators.base import Estimator
     from haltere.evaluate.campaign import campaign
     from haltere.evaluate.compare import compare
+    from haltere.flight.given_wind import with_wind
     from haltere.flight.log import FlightLog, FlightMeta, Home, Stream
     from haltere.flight.solution import Solution
     from haltere.identify.drag import identify_drag
@@ -80,7 +81,7 @@ if TYPE_CHECKING:
 
 __all__ = [
     "Estimator", "FlightLog", "FlightMeta", "HaltereError", "Home", "Scenario", "Solution", "Stream", "__version__",
-    "calibrate_magnetometer", "campaign", "compare", "identify_drag", "inject", "read", "run", "simulate",
+    "calibrate_magnetometer", "campaign", "compare", "identify_drag", "inject", "read", "run", "simulate", "with_wind",
 ]  # fmt: skip
 
 # Where each public name lives: loaded at its first use, so that `import haltere` costs no numba, polars or scipy.
@@ -101,6 +102,7 @@ _HOME = {
     "read": "haltere.readers",
     "run": "haltere.drive",
     "simulate": "haltere.simulate",
+    "with_wind": "haltere.flight.given_wind",
 }
 
 

@@ -85,6 +85,19 @@ def _run(
         float | None,
         typer.Option("--rate", metavar="HZ", help="Rows a second of the solution. Default: every IMU sample.", show_default=False),
     ] = None,
+    wind: Annotated[
+        str | None,
+        typer.Option(
+            "--wind",
+            metavar="W",
+            show_default=False,
+            help="Wind told from outside: N,E[,D] in m/s as it blows to, SPEED@FROM such as 5@270, or a table of a station.",
+        ),
+    ] = None,
+    wind_sd: Annotated[
+        float | None,
+        typer.Option("--wind-sd", metavar="M/S", help="Its 1 sigma. Default: what the table says, else 1.", show_default=False),
+    ] = None,
     columns: Columns = None,
     column: Column = None,
     json: Json = False,
@@ -94,7 +107,7 @@ def _run(
 
     run(
         log, estimator=estimator, preset=preset, config=config, assignments=set_ or [], smooth=smooth, vehicle=vehicle, out=out, rate=rate,
-        columns=columns, column=column, json=json, show=open_,
+        wind=wind, wind_sd=wind_sd, columns=columns, column=column, json=json, show=open_,
     )  # fmt: skip
 
 

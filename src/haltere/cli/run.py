@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 from haltere.cli.columns import column_map
 from haltere.cli.progress import Progress
+from haltere.errors import UsageError
 
 if TYPE_CHECKING:
     from haltere.flight.log import FlightLog
@@ -35,6 +36,8 @@ def run(
     vehicle: Path | None = None,
     out: Path | None = None,
     rate: float | None = None,
+    wind: str | None = None,
+    wind_sd: float | None = None,
     columns: Path | None = None,
     column: list[str] | None = None,
     json: bool = False,
@@ -59,6 +62,8 @@ def run(
         As of `haltere.run`.
     out
         Folder to write; default `default_folder`.
+    wind, wind_sd
+        Wind told from outside and its 1 sigma [m/s], as of `haltere.with_wind`.
     columns, column
         Column map of a single table: a file, and single columns; see `haltere.cli.columns`.
     json
@@ -85,6 +90,10 @@ def run(
     changes = dict(configuration.parse_assignment(text) for text in assignments or [])
     configuration.resolve(estimator, preset, keys, str(config))
     configuration.resolve(estimator, preset, changes, "--set")
+    if wind is not None:
+        _usable_wind(wind, wind_sd)
+    elif wind_sd is not None:
+        raise UsageError("--wind with --wind-sd", "--wind-sd alone", "run")
 
     mapped = column_map(columns, column)
     folder = Path(out) if out is not None else default_folder(log)
@@ -93,6 +102,10 @@ def run(
         from haltere.readers import read
 
         flight = read(log, mapped)
+        if wind is not None:
+            from haltere.flight.given_wind import with_wind
+
+            flight = with_wind(flight, wind, sd=wind_sd)
         progress.stage(estimator, compiles=True)
         from haltere import drive
 
@@ -107,12 +120,24 @@ def run(
             str(folder / "config.toml"),
             *(["--smooth"] if smooth else []),
             *(["--rate", f"{rate:g}"] if rate is not None else []),
+            *(["--wind", wind] if wind is not None else []),
+            *(["--wind-sd", f"{wind_sd:g}"] if wind_sd is not None else []),
             *(["--columns", str(columns)] if columns is not None else []),
             *(word for text in column or [] for word in ("--column", text)),
         ]
         flight = drive.usable(flight, solution.config)
         finish(solution, flight, folder, shlex.join(again), progress)
     told(solution, flight, folder, json=json, show=show)
+
+
+def _usable_wind(wind: str, sd: float | None) -> None:
+    """Refuse an option that is no wind before the log is read."""
+    from haltere.flight.given_wind import SHAPES, parse_wind
+
+    if parse_wind(wind) is None and not Path(wind).is_file():
+        raise UsageError(SHAPES, f"{wind!r}, which is no file", "--wind")
+    if sd is not None and not sd > 0.0:
+        raise UsageError("a positive 1 sigma [m/s]", repr(sd), "--wind-sd")
 
 
 def finish(solution: Solution, flight: FlightLog, folder: Path, command: str, progress: Progress) -> None:

@@ -308,7 +308,7 @@ def _check_rate(flight: FlightLog, out: Checked, imu: Stream, where: str) -> Non
     if rate > RATE_HIGH:
         found = f"{rate:.3g} Hz ({len(imu)} samples in {span:.3g} s)"
         raise HaltereError(f"at most {RATE_HIGH:.0f} IMU samples a second", found, where, "check unit.time and the column map of t")
-    if rate < RATE_MIN:
+    if rate < RATE_MIN * (1.0 - 1e-6):  # stamps are rounded
         known = flight.meta.source.startswith(("PX4", "ArduPilot"))  # whose clocks are known
         looks = next(
             ((unit, word) for unit, word, k in (("us", "microseconds", 1e6), ("ms", "milliseconds", 1e3), ("ns", "nanoseconds", 1e9))

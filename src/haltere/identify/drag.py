@@ -27,6 +27,8 @@ FloatArray = NDArray[np.float64]
 REFUSED, POOR = 0.35, 0.12
 #: A quadratic coefficient less than this many sigma above zero is left away.
 TOLD = 2.0
+#: Without rotor speeds, where their root of thrust is bent by inflow, errors in simulation were this many times 1 sigma.
+DOUBT = 1.5
 #: Mean wind known worse than this is said to be mixed with offsets [m/s].
 WIND_POOR = 1.0
 
@@ -79,7 +81,12 @@ class DragIdentification:
     def sd(self, p: Projection) -> FloatArray:
         """1 sigma of parameters with that of the air density: the linear one goes with its root, the quadratic with itself."""
         share = np.r_[0.5, np.ones(len(p.values) - 1)] * self.density_sd
-        return np.asarray(np.hypot(p.sd, share * np.abs(p.values)))
+        return np.asarray(np.hypot(self.doubt * p.sd, share * np.abs(p.values)))
+
+    @property
+    def doubt(self) -> float:
+        """Factor on 1 sigma for what the model of the drag itself is wrong by."""
+        return 1.0 if self.base.form == "rotors" else DOUBT
 
     @property
     def own(self) -> tuple[FloatArray, FloatArray]:
@@ -101,7 +108,7 @@ class DragIdentification:
         s = self.flights[0]
         load = float(np.mean(np.concatenate([load_of(form, f) for f in self.flights])))
         g = np.array([5.0 * math.sqrt(self.density / 1.225 * max(load, 0.0) / 9.80665), 25.0 * float(np.mean(s.density)) / 1.225])
-        return float(g @ self.haltere.values), float(np.sqrt(max(g @ self.haltere.covariance @ g, 0.0)))
+        return float(g @ self.haltere.values), self.doubt * float(np.sqrt(max(g @ self.haltere.covariance @ g, 0.0)))
 
 
 class NotObservableError(HaltereError):
@@ -159,7 +166,10 @@ def identify_drag(
     if all(w.speed is not None for w in windows):
         forms.insert(0, "rotors")
     else:
-        notes.append("no rotor speeds through the flight: drag goes with the root of the thrust, which inflow and translational lift bend")
+        notes.append(
+            "no rotor speeds through the flight: drag is taken to go with the root of the thrust, which inflow and translational lift bend; "
+            f"1 sigma of what is to be pasted is raised by {DOUBT:g}"
+        )
     fits = {form: fit(form, windows) for form in forms}
     base = min((fits[f] for f in ("rotors", "haltere") if f in fits), key=lambda r: r.bic)
     out = DragIdentification(
@@ -167,9 +177,10 @@ def identify_drag(
         {form: without_wind(form, windows) for form in forms}, windows, motions,
         float(np.mean(np.concatenate([w.density for w in windows]))), max(m.density_sd for m in motions), _force_sd(base), "", notes,
     )  # fmt: skip
-    _leave_away(out)
     out.refused = _judge(out)
-    if out.refused:
+    if not out.refused:
+        _leave_away(out)
+    else:
         raise NotObservableError(
             "flights that tell drag from wind", out.refused, out.name,
             "fly forth and back and sideways at two or more speeds of 3 to 8 m/s, in several directions, with the nose turning between",
@@ -194,10 +205,11 @@ def _leave_away(out: DragIdentification) -> None:
         p: Projection = getattr(out, name)
         free = np.r_[True, (p.values > TOLD * p.sd)[1:]]
         if not free.all():
-            missing = [FORMS[name].names[k].replace("inverse_", "") for k in np.flatnonzero(~free)]
-            bound = ", ".join(f"{n} below {p.values[k] + 2.0 * p.sd[k]:.2g} {FORMS[name].units[k]}" for n, k in
-                              zip([FORMS[name].names[k] for k in np.flatnonzero(~free)], np.flatnonzero(~free), strict=True))  # fmt: skip
-            out.notes.append(f"{name}: {' and '.join(missing)} not told from none, left away ({bound} at 2 sigma): fly faster")
+            missing = [
+                f"{FORMS[name].names[k].replace('inverse_', '1/')} (below {max(p.values[k], 0.0) + 2.0 * p.sd[k]:.2g} {FORMS[name].units[k]})"
+                for k in np.flatnonzero(~free)
+            ]
+            out.notes.append(f"{name}: {' and '.join(missing)} not told from none and left away; 2 sigma. Fly faster")
             setattr(out, name, project(out.base, name, free))
 
 
@@ -207,7 +219,8 @@ def _judge(out: DragIdentification) -> str:
     if not base.converged:
         out.notes.append("the fit did not settle: what it gives is rough")
     if base.log_sd > REFUSED:
-        return f"linear drag known to {100.0 * base.log_sd:.0f} % only (1 sigma; {100.0 * REFUSED:.0f} % allowed): not observable"
+        known = f"to {100.0 * base.log_sd:.0f} %" if base.log_sd < 1.0 else "not even to its order"
+        return f"not observable: linear drag known {known} (1 sigma; {100.0 * REFUSED:.0f} % allowed)"
     if base.log_sd > POOR:
         out.notes.append(f"poor: linear drag is known to {100.0 * base.log_sd:.0f} % (1 sigma); fly longer, or at more different speeds")
     for k, (part, m) in enumerate(zip(base.parts, out.motions, strict=True)):

@@ -19,9 +19,9 @@ __all__ = ["BLOCKS", "DOF", "WINDOW", "NisSeries", "band", "nees_series", "nees_
 
 FloatArray = NDArray[np.float64]
 #: Blocks of the error state, in order.
-BLOCKS = ("attitude", "velocity", "position", "gyro_bias", "accel_bias", "baro_bias")
-#: Degrees of freedom of each.
-DOF = dict.fromkeys(BLOCKS, 3) | {"baro_bias": 1}
+BLOCKS = ("attitude", "velocity", "position", "gyro_bias", "accel_bias", "baro_bias", "wind")
+#: Degrees of freedom of each; of the wind only its horizontal part counts.
+DOF = dict.fromkeys(BLOCKS, 3) | {"baro_bias": 1, "wind": 2}
 #: Measurements in the moving mean of the NIS: few enough to show when, enough for a band of about 0.5 to 1.6 (one component).
 WINDOW = 25
 
@@ -114,7 +114,7 @@ def _moving_sum(x: FloatArray, window: int) -> FloatArray:
 
 
 #: What `nees_series` reads of a truth.
-_READ = ("q_", "vel_", "pos_", "gyro_bias_", "accel_bias_", "baro_bias", "lat", "lon", "alt")
+_READ = ("q_", "vel_", "pos_", "gyro_bias_", "accel_bias_", "baro_bias", "wind_", "lat", "lon", "alt")
 
 
 def _around(truth: Stream, t: FloatArray) -> Stream:
@@ -181,10 +181,17 @@ def nees_series(solution: Solution, truth: Stream) -> dict[str, tuple[FloatArray
     if "baro_bias" in solution and "baro_bias" in truth and np.isfinite(truth["baro_bias"]).sum() > 1:
         good = np.isfinite(truth["baro_bias"])
         errors["baro_bias"] = (np.interp(t, truth.t[good], truth["baro_bias"][good]) - solution["baro_bias"][row])[:, None]
+    if "wind" in cov:
+        reference = truth.vector("wind", "ne")
+        good = np.isfinite(reference).all(axis=1)
+        if "wind_n" in solution and np.count_nonzero(good) > 1:
+            there = np.column_stack([np.interp(t, truth.t[good], reference[good, k]) for k in range(2)])
+            errors["wind"] = there - _rows(solution, row, "wind", "ne")
     for block in BLOCKS:
         if block in errors and block in cov:
             e = errors[block]
-            out[block] = (t, _squared_distance(e, cov[block][inside]) / e.shape[1])
+            k = e.shape[1]
+            out[block] = (t, _squared_distance(e, cov[block][inside, :k, :k]) / k)
     return out
 
 

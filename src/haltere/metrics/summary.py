@@ -14,8 +14,12 @@ from haltere.metrics.consistency import nees_series, nees_table, nis_table
 from haltere.metrics.errors import error_series, error_table
 from haltere.metrics.sensors import findings, sampling, sensor_table
 from haltere.metrics.whiteness import whiteness_series, whiteness_table
+from haltere.metrics.wind_quality import wind_table
 
 __all__ = ["finite", "gaps_of", "summarise"]
+
+#: What is said of a wind told for a flight of which none is estimated.
+UNUSED_WIND = "the wind told from outside was not used: it takes rotors or an airspeed in the log, and an estimator with a wind"
 
 
 def gaps_of(t: np.ndarray[Any, np.dtype[np.float64]]) -> int:
@@ -86,8 +90,12 @@ def summarise(solution: Solution, flight: FlightLog, facts: dict[str, Any], scor
         }
     summary["health"] = _health(solution, flight)
     summary["sensors"] = sensor_table(solution, flight) if scored else {}
+    wind = wind_table(solution, flight) if scored else {}
+    if wind:
+        summary["wind"] = wind
     summary["findings"] = findings(summary["sensors"])
-    summary["warnings"] = facts["warnings"]
+    unused = "wind" in flight and len(flight["wind"]) > 0 and "wind_n" not in solution
+    summary["warnings"] = facts["warnings"] + ([UNUSED_WIND] if unused else [])
     summary["timings"] = facts["timings"]
     solution.summary = finite(summary)
 

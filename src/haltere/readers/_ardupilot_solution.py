@@ -118,6 +118,12 @@ def add_solution(log: DataFlash, builder: Builder, params: dict[str, float]) -> 
             if "AZbias" in states:
                 columns["accel_bias_z"] = states.get("AZbias") * 0.01  # whole cm/s^2
             pieces.append((us, columns))
+        for lane, states in _lanes(log, family.replace("KF", "KV"), 2).items():
+            us = log.us(states)
+            mine = _rows_in_charge(us, lane, charge) if "C" in states else np.ones(len(us), bool)  # else logged of the primary lane only
+            variances = {f"sd_wind_{a}": states.get(f"V{k}")[mine] for a, k in (("n", 22), ("e", 23))}
+            pieces.append((us[mine], {name: np.sqrt(np.where(v > 0.0, v, np.nan)) for name, v in variances.items()}))
+        _drop_no_wind(pieces, builder)
         if not has_origin:
             builder.note("onboard has no pos_n, pos_e, pos_d: the log has no ORGN message, so their origin is unknown")
     else:
@@ -130,6 +136,16 @@ def add_solution(log: DataFlash, builder: Builder, params: dict[str, float]) -> 
         pieces.append((log.us(position), {"lat": position.get("Lat"), "lon": position.get("Lng"), "alt": position.get("Alt")}))
     us, merged = merge_rows(pieces)
     builder.add("onboard", us, merged)
+
+
+def _drop_no_wind(pieces: list[tuple[IntArray, Columns]], builder: Builder) -> None:
+    """A wind of exactly zero from beginning to end was never estimated: the states are not in use on every vehicle."""
+    winds = [columns[name] for _, columns in pieces for name in ("wind_n", "wind_e") if name in columns]
+    if winds and not any(np.nan_to_num(w).any() for w in winds):
+        for _, columns in pieces:
+            for name in ("wind_n", "wind_e", "sd_wind_n", "sd_wind_e"):
+                columns.pop(name, None)
+        builder.note("onboard wind is zero throughout, so the autopilot did not estimate it: left out")
 
 
 def _set_origin(log: DataFlash, builder: Builder) -> bool:

@@ -54,8 +54,9 @@ def add_solution(log: Log, builder: Builder) -> None:
     wind = log.one("wind", "wind_estimate")
     if wind is not None:
         columns = {"wind_n": wind.get("windspeed_north"), "wind_e": wind.get("windspeed_east")}
-        variance = wind.get("variance_north", "covariance_north") + wind.get("variance_east", "covariance_east")
-        idle = variance == 0.0
+        variances = [wind.get(f"variance_{a}", f"covariance_{a}") for a in ("north", "east")]
+        idle = variances[0] + variances[1] == 0.0
+        columns |= {f"sd_wind_{a}": np.sqrt(np.where(v > 0.0, v, np.nan)) for a, v in zip("ne", variances, strict=True)}
         if idle.any():
             builder.note(f"onboard wind has zero variance, so was not estimated, in {int(idle.sum())} of {len(wind)} samples: NaN")
         for values in columns.values():

@@ -155,16 +155,39 @@ def _mavros(topics: Topics, builder: Builder) -> list[Piece]:
             break
     for wind in topics.of("geometry_msgs/TwistWithCovarianceStamped", "geometry_msgs/TwistStamped"):
         if wind.words[-1:] == ["wind_estimation"]:
-            stem = "twist.twist.linear" if wind.msgtype.endswith("TwistWithCovarianceStamped") else "twist.linear"
-            blowing = enu_to_ned(wind, stem, "wind")
-            if not np.nan_to_num(blowing["wind_d"]).any():
-                del blowing["wind_d"]
-            pieces.append((wind.us, blowing))
+            pieces.append((wind.us, _mavros_wind(wind, builder)))
             said.append(f"wind {wind.name}")
             break
     if said:
         builder.note(f"onboard is {', '.join(said)}; east, north, up and forward, left, up turned to NED and FRD")
     return pieces
+
+
+def _mavros_wind(wind: Topic, builder: Builder) -> Columns:
+    """Wind of MAVROS, blowing to: its x is east, y north, z up, but not in every version.
+
+    Until 2018 it was a TwistStamped of ArduPilot's wind alone, whose direction is where the wind comes *from*, handed on as it is, and
+    its vertical part down. Then PX4's came right and ArduPilot's mirrored, until 1.3 of 2020; a covariance tells them apart.
+    """
+    if not wind.msgtype.endswith("TwistWithCovarianceStamped"):
+        builder.note(
+            f"onboard wind turned round: {wind.name} without covariance, as MAVROS before 2018 sent it, is where the wind comes from"
+        )
+        columns = {name: -v for name, v in enu_to_ned(wind, "twist.linear", "wind").items()}
+    else:
+        columns = enu_to_ned(wind, "twist.twist.linear", "wind")
+        variances = [wind.get("twist.covariance[7]"), wind.get("twist.covariance[0]")]
+        sd = {f"sd_wind_{a}": np.sqrt(np.where(v > 0.0, v, np.nan)) for a, v in zip("ne", variances, strict=True)}
+        known = {name: v for name, v in sd.items() if np.isfinite(v).any()}
+        if not known:
+            builder.note(
+                f"onboard wind {wind.name} has no covariance, so it is ArduPilot's; MAVROS before 1.3 (2020) mirrored its direction, "
+                "which nothing in the bag tells"
+            )
+        columns |= known
+    if not np.nan_to_num(columns["wind_d"]).any():
+        del columns["wind_d"]
+    return columns
 
 
 def _attitude(topics: Topics) -> Topic | None:
@@ -198,7 +221,9 @@ def _px4(topics: Topics, builder: Builder) -> list[Piece]:
         pieces.append((t.us, {name: t.get(name) for name in ("lat", "lon", "alt")}))
     for t in topics.of("px4_msgs/Wind")[:1]:
         columns = {"wind_n": t.get("windspeed_north"), "wind_e": t.get("windspeed_east")}
-        idle = t.get("variance_north") + t.get("variance_east") == 0.0
+        variances = [t.get("variance_north"), t.get("variance_east")]
+        idle = variances[0] + variances[1] == 0.0
+        columns |= {f"sd_wind_{a}": np.sqrt(np.where(v > 0.0, v, np.nan)) for a, v in zip("ne", variances, strict=True)}
         for values in columns.values():
             values[idle] = np.nan
         pieces.append((t.us, columns))

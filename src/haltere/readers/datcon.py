@@ -223,7 +223,16 @@ def _add_onboard(table: _Table, builder: Builder) -> None:
     if not len(rows):
         return
     columns = q_from_euler(*(a[rows] * DEG for a in angles)) | {f"vel_{a}": v[rows] for a, v in zip("ned", velocity, strict=True)}
-    builder.add("onboard", table.us[rows], columns | {"lat": lat[rows], "lon": lon[rows]})
+    builder.add("onboard", table.us[rows], columns | {"lat": lat[rows], "lon": lon[rows]} | _wind(table, rows))
+
+
+def _wind(table: _Table, rows: NDArray[np.intp]) -> Columns:
+    """DJI's own wind: speed and the direction it comes from; NaN while it is zero, which is before it is estimated."""
+    speed, direction = table.get("Wind:velocity")[rows], table.get("Wind:fromDir")[rows]
+    speed = np.where(speed > 0.0, speed, np.nan)
+    if not np.isfinite(speed * direction).any():
+        return {}
+    return {"wind_n": -speed * np.cos(direction * DEG), "wind_e": -speed * np.sin(direction * DEG)}
 
 
 def _set_utc(table: _Table, builder: Builder) -> None:

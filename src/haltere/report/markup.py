@@ -20,6 +20,7 @@ class Section:
     note: str = ""
     figures: list[Figure] = field(default_factory=list)
     after: str = ""
+    before: str = ""
 
 
 def escape(text: object) -> str:
@@ -47,6 +48,8 @@ def section_html(section: Section, figures: list[Figure]) -> str:
     out = [f'<section id="{section.key}"><h2>{escape(section.title)}</h2>']
     if section.note:
         out.append(f'<p class="note">{section.note}</p>')
+    if section.before:
+        out.append(section.before)
     for figure in section.figures:
         if "title" in figure:
             out.append(f"<h3>{escape(figure['title'])}</h3>")

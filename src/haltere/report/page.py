@@ -14,6 +14,7 @@ from haltere.report.markup import Section, escape, section_html
 from haltere.report.panels import Figure
 from haltere.report.series import Pool
 from haltere.report.view import view
+from haltere.report.wind import wind
 from haltere.report.words import facts, verdict
 
 __all__ = ["page"]
@@ -44,7 +45,7 @@ def page(solution: Solution, flight: FlightLog, command: str | None = None) -> s
     timeline = overview.timeline(c)
     timeline.after = tables.events(c)
     parts = [
-        timeline, sections.attitude(c), sections.velocity(c), sections.position(c), view(c), sections.biases(c), sections.wind(c),
+        timeline, sections.attitude(c), sections.velocity(c), sections.position(c), view(c), sections.biases(c), wind(c),
         sections.errors(c), sections.innovations(c), tables.consistency(c), health(c), tables.data(c), tables.configuration(c, command),
     ]  # fmt: skip
     shown = [s for s in parts if s is not None and (s.figures or s.note or s.after)]

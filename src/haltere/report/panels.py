@@ -87,20 +87,22 @@ class Panels:
         unit: str = "",
         resolution: float = 1e-3,
         period: float | None = None,
+        about: float = 0.0,
         width: float = 1.9,
         centred: bool = False,
         slow: bool = False,
     ) -> None:
         """A line, with its band of one standard deviation where ``sd`` is given: about the line, or about zero (``centred``).
 
-        A ``slow`` quantity needs no more room in the page than others.
+        A ``slow`` quantity needs no more room in the page than others. An angle is shown within half a ``period`` of ``about``.
         """
         columns = [y] if sd is None else [y, sd]
-        ids = self.pool.series(t, columns, [resolution] * len(columns), period, weight=1.0 if sd is None or centred or slow else BANDED)
+        weight = 1.0 if sd is None or centred or slow else BANDED
+        ids = self.pool.series(t, columns, [resolution] * len(columns), period, weight=weight, about=about)
         if not ids:
             return
         good = np.isfinite(y) & np.isfinite(t)
-        finite = y[good] if period is None else y[good] - period * np.floor(y[good] / period + 0.5)
+        finite = y[good] if period is None else y[good] - period * np.floor((y[good] - about) / period + 0.5)
         reach = 0.0
         if sd is not None:
             known = sd[good & np.isfinite(sd)]

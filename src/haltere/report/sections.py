@@ -1,4 +1,4 @@
-"""Sections of series over time: attitude, velocity, position, biases, wind, errors, innovations. It computes no results."""
+"""Sections of series over time: attitude, velocity, position, biases, errors, innovations. It computes no results."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from haltere.report.markup import Section
 from haltere.report.panels import Panels
 from haltere.report.style import SENSOR_COLOURS
 
-__all__ = ["DEG", "angle_columns", "attitude", "biases", "errors", "innovations", "position", "velocity", "wind"]
+__all__ = ["DEG", "angle_columns", "attitude", "biases", "errors", "innovations", "position", "velocity"]
 
 FloatArray = NDArray[np.float64]
 DEG = 180.0 / math.pi
@@ -135,19 +135,6 @@ def biases(c: Context) -> Section | None:
         for label, stream in c.references:
             panels.line(k, label, label, stream.t, factor * stream.get(name), unit=unit, resolution=resolution, width=1.0)
     return Section("biases", "Sensor biases", "Measured minus true; the estimate is subtracted from the sensor.", [panels.figure()])
-
-
-def wind(c: Context) -> Section | None:
-    """Wind with 1σ, where the estimator has it."""
-    axes = [a for a in "ned" if f"wind_{a}" in c.solution]
-    if not axes:
-        return None
-    panels = _panels(c, "wind", [f"{WORDS[a]} [m/s]" for a in axes])
-    for k, a in enumerate(axes):
-        panels.line(k, "estimate", "estimate", c.solution.t, c.solution[f"wind_{a}"], _sd(c, f"sd_wind_{a}"), unit="m/s")
-        for name, stream in c.references:
-            panels.line(k, name, name, stream.t, stream.get(f"wind_{a}"), unit="m/s", width=1.0)
-    return Section("wind", "Wind", "Velocity of the air over ground: where it blows to.", [panels.figure()])
 
 
 def errors(c: Context) -> Section | None:

@@ -82,9 +82,11 @@ def breaks(t: FloatArray) -> NDArray[np.bool_]:
 class _Prepared:
     """Finite rows of times and columns, angles unwrapped, with the number of the unbroken piece each row belongs to."""
 
-    def __init__(self, t: FloatArray, columns: Sequence[FloatArray], period: float | None, even: bool = False) -> None:
+    def __init__(
+        self, t: FloatArray, columns: Sequence[FloatArray], period: float | None, even: bool = False, about: float = 0.0
+    ) -> None:  # fmt: skip
         good = np.isfinite(columns[0]) & np.isfinite(t)
-        self.t, self.columns, self.period = t[good], [c[good] for c in columns], period
+        self.t, self.columns, self.period, self.about = t[good], [c[good] for c in columns], period, about
         self.n, self.even = len(self.t), even
         self.piece = np.cumsum(breaks(self.t))
         if period is not None and self.n:
@@ -104,7 +106,7 @@ class _Prepared:
         t, piece, columns = self.t[rows], self.piece[rows], [c[rows] for c in self.columns]
         cut = np.diff(piece) != 0
         if self.period is not None:
-            turn = np.floor(columns[0] / self.period + 0.5)
+            turn = np.floor((columns[0] - self.about) / self.period + 0.5)
             columns[0] = columns[0] - self.period * turn
             cut |= np.diff(turn) != 0
         where = np.flatnonzero(cut) + 1
@@ -233,6 +235,7 @@ class Pool:
         *,
         even: bool = False,
         weight: float = 1.0,
+        about: float = 0.0,
     ) -> list[int]:
         """Keep columns over time, as many rows of them as the page has room for in the end.
 
@@ -246,16 +249,18 @@ class Pool:
             Thin it evenly, as suits a track, rather than by its extremes.
         weight
             How much room it gets relative to others, where there is not room for all.
+        about
+            Middle of the interval of one period in which the first column is shown.
 
         Returns
         -------
         list
             Indices of the times and of each column; nothing where no row is finite.
         """
-        key = (tuple(hash(np.ascontiguousarray(a, np.float64).tobytes()) for a in (t, *columns)), tuple(resolutions), period, even)
+        key = (tuple(hash(np.ascontiguousarray(a, np.float64).tobytes()) for a in (t, *columns)), tuple(resolutions), period, even, about)
         if key in self._known:
             return self._known[key]
-        prepared = _Prepared(t, columns, period, even)
+        prepared = _Prepared(t, columns, period, even, about)
         if prepared.n == 0:
             return []
         series = _Series(prepared, len(self._arrays), (1e-4, *resolutions), weight)

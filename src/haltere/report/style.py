@@ -16,6 +16,7 @@ COLOURS: dict[str, tuple[str, str]] = {
     "barometer": ("#8a3fb0", "#c792ea"),
     "magnetometer": ("#0b8484", "#45c8c8"),
     "imu": ("#4a5a78", "#9fb3d9"),
+    "air": ("#0e7490", "#3fc6e0"),
     "assumed": ("#6f757d", "#a4abb5"),
     "refused": ("#cf1f2e", "#ff6b74"),
     "deweighted": ("#7d5f00", "#fff176"),
@@ -67,6 +68,9 @@ SENSOR_COLOURS = {
     "barometer": "barometer",
     "magnetometer": "magnetometer",
     "imu": "imu",
+    "airdata": "air",
+    "drag": "air",
+    "wind": "air",
 }
 
 #: What every axis has.

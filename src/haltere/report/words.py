@@ -17,11 +17,14 @@ from haltere.report.series import Pool
 
 __all__ = [
     "Verdict", "count", "discarded", "facts", "fixed", "nis_in_words", "number", "verdict", "verdict_of",
-    "whiteness_in_words",
+    "whiteness_in_words", "wind_in_words",
 ]  # fmt: skip
 
 #: Share of a stream's samples above which a discard is worth a word in the verdict.
 WORTH_TELLING = 0.01
+
+#: Sixteenths of the compass from north.
+SIXTEENTHS = ("N", "NNE", "NE", "ENE", "E", "ESE", "SE", "SSE", "S", "SSW", "SW", "WSW", "W", "WNW", "NW", "NNW")
 
 
 @dataclass
@@ -286,6 +289,18 @@ def whiteness_in_words(components: dict[str, dict[str, Any]]) -> str:
     return "weakly correlated: not all of the motion or the sensor's errors is modelled"
 
 
+def wind_in_words(said: dict[str, Any]) -> str:
+    """Mean wind of the table ``wind`` of a summary: speed and where it comes from, with 1 sigma."""
+    mean = said.get("mean")
+    if mean is None or mean["speed"] is None:
+        return ""
+    speed = f"{fixed(mean['speed'])}" + (f" ± {fixed(mean['sd_speed'])}" if mean["sd_speed"] is not None else "") + " m/s"
+    if mean["sd_from_deg"] is None:
+        return f"{speed}, direction not known"
+    corner = SIXTEENTHS[round(mean["from_deg"] / 22.5) % 16]
+    return f"{speed} from {mean['from_deg']:.0f}° ± {math.ceil(mean['sd_from_deg'])}° ({corner})"
+
+
 def facts(c: Context) -> list[tuple[str, str]]:
     """The flight in a few lines: name and value."""
     solution, flight, summary = c.solution, c.flight, c.solution.summary
@@ -316,6 +331,8 @@ def facts(c: Context) -> list[tuple[str, str]]:
         way = float(np.sum(0.5 * (ground[1:] + ground[:-1]) * np.minimum(np.diff(solution.t), 1.0)))
         low, high = -float(solution["pos_d"].max()), -float(solution["pos_d"].min())
         add("track", f"{way:.0f} m long; height {low:z.1f} to {high:z.1f} m from the origin")
+    if summary.get("wind"):
+        add("wind", ": ".join(w for w in (wind_in_words(summary["wind"]), summary["wind"]["verdict"]) if w))
     for fault in meta.faults:
         add("injected fault", ", ".join(f"{k} {v}" for k, v in fault.items()))
     timings = summary.get("timings", {})
