@@ -29,6 +29,8 @@ REFUSED, POOR = 0.35, 0.12
 TOLD = 2.0
 #: Without rotor speeds, where their root of thrust is bent by inflow, errors in simulation were this many times 1 sigma.
 DOUBT = 1.5
+#: Least spread of the ground velocity [m/s, root mean square], largest offset [m/s^2] and least quadratic drag [sigma] that are believed.
+LEAST_SPREAD, LARGEST_OFFSET, LEAST_C = 0.7, 1.0, -3.0
 #: Mean wind known worse than this is said to be mixed with offsets [m/s].
 WIND_POOR = 1.0
 
@@ -162,19 +164,19 @@ def identify_drag(
     motions = [motion(log.without("onboard", "truth"), config, set) for log in logs]
     windows = [samples(m) for m in motions]
     notes = list(dict.fromkeys(note for m in motions for note in m.notes))
-    forms = ["haltere", "px4", "ardupilot"]
+    forms = ["haltere", "px4", "ardupilot"] if _spread(windows) >= LEAST_SPREAD else ["haltere"]  # of hover nothing is to be had
     if all(w.speed is not None for w in windows):
         forms.insert(0, "rotors")
     else:
         notes.append(
-            "no rotor speeds through the flight: drag is taken to go with the root of the thrust, which inflow and translational lift bend; "
-            f"1 sigma of what is to be pasted is raised by {DOUBT:g}"
+            "no rotor speeds through the flight: drag is taken to go with the root of the thrust, which inflow and translational lift "
+            f"bend; 1 sigma of what is to be pasted is raised by {DOUBT:g}"
         )
     fits = {form: fit(form, windows) for form in forms}
     base = min((fits[f] for f in ("rotors", "haltere") if f in fits), key=lambda r: r.bic)
     out = DragIdentification(
         fits, base, project(base, "haltere"), project(base, "px4"), project(base, "ardupilot"),
-        {form: without_wind(form, windows) for form in forms}, windows, motions,
+        {form: without_wind(form, windows) for form in (*forms, "px4")}, windows, motions,
         float(np.mean(np.concatenate([w.density for w in windows]))), max(m.density_sd for m in motions), _force_sd(base), "", notes,
     )  # fmt: skip
     out.refused = _judge(out)
@@ -205,12 +207,30 @@ def _leave_away(out: DragIdentification) -> None:
         p: Projection = getattr(out, name)
         free = np.r_[True, (p.values > TOLD * p.sd)[1:]]
         if not free.all():
-            missing = [
-                f"{FORMS[name].names[k].replace('inverse_', '1/')} (below {max(p.values[k], 0.0) + 2.0 * p.sd[k]:.2g} {FORMS[name].units[k]})"
-                for k in np.flatnonzero(~free)
-            ]
+            form, most = FORMS[name], np.maximum(p.values, 0.0) + 2.0 * p.sd
+            off = np.flatnonzero(~free)
+            missing = [f"{form.names[k].replace('inverse_', '1/')} (below {most[k]:.2g} {form.units[k]})" for k in off]
             out.notes.append(f"{name}: {' and '.join(missing)} not told from none and left away; 2 sigma. Fly faster")
             setattr(out, name, project(out.base, name, free))
+
+
+def _spread(windows: list[Samples]) -> float:
+    """Spread of the horizontal ground velocity within flights, root mean square [m/s]."""
+    return float(np.sqrt(np.mean([np.sum(np.var(s.vel_n[:, :2], axis=0)) for s in windows])))
+
+
+def _odd(out: DragIdentification) -> str:
+    """Why a result that looks certain is none: too little motion, or numbers that no vehicle has."""
+    base = out.base
+    spread = _spread(out.flights)
+    if spread < LEAST_SPREAD:
+        return f"not observable: the horizontal velocity varies by {spread:.2f} m/s only (rms; {LEAST_SPREAD:g} needed), as in hover"
+    offset = max(float(np.max(np.abs(part.rest[:2]))) for part in base.parts)
+    if offset > LARGEST_OFFSET:
+        return f"no plausible fit: an offset of {offset:.1f} m/s^2 across the thrust axis"
+    if base.values[1] < LEAST_C * base.sd[1]:
+        return f"no plausible fit: a quadratic drag of {base.values[1]:.2g} 1/m, below zero by more than chance"
+    return ""
 
 
 def _judge(out: DragIdentification) -> str:
@@ -221,6 +241,8 @@ def _judge(out: DragIdentification) -> str:
     if base.log_sd > REFUSED:
         known = f"to {100.0 * base.log_sd:.0f} %" if base.log_sd < 1.0 else "not even to its order"
         return f"not observable: linear drag known {known} (1 sigma; {100.0 * REFUSED:.0f} % allowed)"
+    if found := _odd(out):
+        return found
     if base.log_sd > POOR:
         out.notes.append(f"poor: linear drag is known to {100.0 * base.log_sd:.0f} % (1 sigma); fly longer, or at more different speeds")
     for k, (part, m) in enumerate(zip(base.parts, out.motions, strict=True)):

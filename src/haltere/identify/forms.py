@@ -46,19 +46,19 @@ class Form:
 #: (031de06), each with the density as that code computes it.
 FORMS: dict[str, Form] = {
     "haltere": Form(
-        ("mu", "c"), ("1/s", "1/m"), (0.3, 0.0), (0.7, 0.05),
+        ("mu", "c"), ("1/s", "1/m"), (0.3, 0.01), (0.7, 0.02),
         "f = -mu sqrt(rho/rho0) sqrt(T/g) v - (rho/rho0) c |v_a| v",
     ),
     "rotors": Form(
-        ("h", "c"), ("1/rad", "1/m"), (1.5e-4, 0.0), (1.5, 0.05),
+        ("h", "c"), ("1/rad", "1/m"), (1.5e-4, 0.01), (1.5, 0.02),
         "f = -(rho/rho0) (h S + c |v_a|) v, S the sum of the rotor speeds",
     ),
     "px4": Form(
-        ("mcoef", "inverse_bcoef_x", "inverse_bcoef_y"), ("1/s", "m^2/kg", "m^2/kg"), (0.3, 0.0, 0.0), (0.7, 0.08, 0.08),
+        ("mcoef", "inverse_bcoef_x", "inverse_bcoef_y"), ("1/s", "m^2/kg", "m^2/kg"), (0.3, 0.016, 0.016), (0.7, 0.035, 0.035),
         "f = -MCOEF sqrt(rho/rho0) v - rho/2 |v_a| v / BCOEF, 1/BCOEF by the direction of v between 1/BCOEF_X and 1/BCOEF_Y",
     ),
     "ardupilot": Form(
-        ("mcoef", "inverse_bcoef_x", "inverse_bcoef_y"), ("1/s", "m^2/kg", "m^2/kg"), (0.3, 0.0, 0.0), (0.7, 0.08, 0.08),
+        ("mcoef", "inverse_bcoef_x", "inverse_bcoef_y"), ("1/s", "m^2/kg", "m^2/kg"), (0.3, 0.016, 0.016), (0.7, 0.035, 0.035),
         "f = -MCOEF sqrt(EAS2TAS) v - rho/2 |v| v / BCOEF, each axis by itself",
     ),
 }  # fmt: skip
@@ -108,17 +108,11 @@ def drag_force(form: str, p: FloatArray, v: FloatArray, load: FloatArray, rho: F
 
 
 def drag_slopes(form: str, p: FloatArray, v: FloatArray, load: FloatArray, rho: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Derivatives of `drag_force` by its parameters (n, 2, p) and by the air velocity (n, 2, 3), by differences.
+    """Derivatives of `drag_force` by its parameters (n, 2, p) and by the air velocity (n, 2, 3).
 
-    The models are linear in their parameters, so that only those by the velocity are not exact, to 1e-8.
+    The models are linear in their parameters; by the velocity they are differences, good to 1e-8.
     """
-    by_p = np.empty((len(v), 2, len(p)))
-    sizes = (FORMS[form].prior[0], *FORMS[form].scale[1:])
-    for k, size in enumerate(sizes):
-        h = 1e-3 * size
-        up, down = p.copy(), p.copy()
-        up[k], down[k] = p[k] + h, p[k] - h
-        by_p[:, :, k] = (drag_force(form, up, v, load, rho) - drag_force(form, down, v, load, rho)) / (2.0 * h)
+    by_p = np.stack([drag_force(form, unit, v, load, rho) for unit in np.eye(len(p))], axis=2)
     by_v = np.empty((len(v), 2, 3))
     for k in range(3):
         up, down = v.copy(), v.copy()
