@@ -42,7 +42,7 @@ ROUNDS, STEPS = 4, 25
 
 def load_of(form: str, s: Samples) -> FloatArray:
     """What a model's linear drag goes with: thrust per mass [m/s^2], or the sum of the rotor speeds [rad/s]."""
-    if form != "rotors":
+    if form not in ("rotors", "lumped"):
         return s.thrust
     if s.speed is None:  # whoever asks has looked
         raise HaltereError("rotor speeds through the flight", "none", s.name)
@@ -180,11 +180,11 @@ def _covariance(t: FloatArray, H: FloatArray, colour: FloatArray) -> Coloured:
     )
 
 
-def _prior(form: str, free: BoolArray) -> tuple[FloatArray, FloatArray]:
+def _prior(form: str, free: BoolArray, wind_sd: float = WIND_SD) -> tuple[FloatArray, FloatArray]:
     """Mean and precision of p, the first as logarithm, of the rest and the wind of a flight."""
     f = FORMS[form]
     mean = np.r_[np.log(f.prior[0]), np.array(f.prior[1:]), np.zeros(N_OWN)]
-    sd = np.r_[np.array(f.scale), ELSE_SD, WIND_SD, WIND_SD]
+    sd = np.r_[np.array(f.scale), ELSE_SD, wind_sd, wind_sd]
     precision = 1.0 / sd**2
     precision[: len(free)][~free] = 1e18
     mean[: len(free)][~free] = 0.0
@@ -214,7 +214,7 @@ def _restricted(c: Coloured, X: FloatArray, r: FloatArray, precision: FloatArray
     return float(q - z @ z + c.log_det + 2.0 * np.sum(np.log(np.diag(L))) - np.sum(np.log(precision)))
 
 
-def fit(form: str, flights: list[Samples], free: BoolArray | None = None) -> Result:
+def fit(form: str, flights: list[Samples], free: BoolArray | None = None, wind_sd: float = WIND_SD) -> Result:
     """Fit a model of `FORMS` to flights, each with its own wind, rest and colour.
 
     Parameters
@@ -225,14 +225,17 @@ def fit(form: str, flights: list[Samples], free: BoolArray | None = None) -> Res
         Windows in the air.
     free
         Which parameters are fitted; the others are zero. Default: all.
+    wind_sd
+        1 sigma of the mean wind before the flight [m/s]: little where the air is known to be still.
     """
     k = len(FORMS[form].names)
     free = np.ones(k, bool) if free is None else free
-    mean, precision = _prior(form, free)
+    mean, precision = _prior(form, free, wind_sd)
     p = np.array(FORMS[form].prior)
     parts = [Part(s, paths=np.zeros((len(s.t), 4))) for s in flights]
     for part in parts:  # the force of the mean wind, so that the first step is near
-        _start(part, form, p)
+        if wind_sd > 1.0:
+            _start(part, form, p)
     steps, done = 0, False
     for round_ in range(ROUNDS):
         p, used, done = _solve(form, p, parts, mean, precision)

@@ -53,6 +53,11 @@ FORMS: dict[str, Form] = {
         ("h", "c"), ("1/rad", "1/m"), (1.5e-4, 0.01), (1.5, 0.02),
         "f = -(rho/rho0) (h S + c |v_a|) v, S the sum of the rotor speeds",
     ),
+    "lumped": Form(
+        ("hx0", "hx2", "hx3", "hy0", "hy2", "hy3"), ("1/rad", "1/s", "1/m", "1/rad", "1/s", "1/m"),
+        (1.5e-4, 0.0, 0.01, 1.5e-4, 0.0, 0.01), (1.5, 0.1, 0.02, 3e-4, 0.1, 0.02),
+        "f = -(rho/rho0) (h0 S + h2 + h3 |v_a|) v, each axis by itself",
+    ),
     "px4": Form(
         ("mcoef", "inverse_bcoef_x", "inverse_bcoef_y"), ("1/s", "m^2/kg", "m^2/kg"), (0.3, 0.016, 0.016), (0.7, 0.035, 0.035),
         "f = -MCOEF sqrt(rho/rho0) v - rho/2 |v_a| v / BCOEF, 1/BCOEF by the direction of v between 1/BCOEF_X and 1/BCOEF_Y",
@@ -85,7 +90,7 @@ def drag_force(form: str, p: FloatArray, v: FloatArray, load: FloatArray, rho: F
     v
         Velocity through the air, body FRD (n, 3) [m/s].
     load
-        Thrust per mass (n,) [m/s^2], for ``rotors`` the sum of their speeds [rad/s].
+        Thrust per mass (n,) [m/s^2], for ``rotors`` and ``lumped`` the sum of their speeds [rad/s].
     rho
         Air density (n,) [kg/m^3].
     """
@@ -96,6 +101,9 @@ def drag_force(form: str, p: FloatArray, v: FloatArray, load: FloatArray, rho: F
         return np.asarray(-(linear + rho / RHO0 * p[1] * speed)[:, None] * across)
     if form == "rotors":
         return np.asarray(-(rho / RHO0 * (p[0] * load + p[1] * speed))[:, None] * across)
+    if form == "lumped":
+        slopes = (np.outer(load, p[[0, 3]]) + p[[1, 4]] + np.outer(speed, p[[2, 5]])) * (rho / RHO0)[:, None]
+        return np.asarray(-slopes * across)
     if form == "px4":
         level = np.maximum(across[:, 0] ** 2 + across[:, 1] ** 2, 1e-12)
         # PX4 takes the root of the mean square of the two; the mean is smooth through zero, and 5 % less where one is twice the other

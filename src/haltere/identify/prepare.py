@@ -19,7 +19,7 @@ from haltere.flight.log import FlightLog
 from haltere.flight.solution import Solution
 from haltere.identify.forms import RHO0
 
-__all__ = ["LEAST", "Motion", "Samples", "air_density", "motion", "samples"]
+__all__ = ["LEAST", "Motion", "Samples", "air_density", "matrices", "motion", "samples"]
 
 FloatArray = NDArray[np.float64]
 BoolArray = NDArray[np.bool_]
@@ -99,7 +99,10 @@ class Samples:
 
 
 def motion(
-    flight: FlightLog, config: Config | Mapping[str, Any] | str | Path | None = None, set: Mapping[str, Any] | None = None
+    flight: FlightLog,
+    config: Config | Mapping[str, Any] | str | Path | None = None,
+    set: Mapping[str, Any] | None = None,
+    least: float = LEAST,
 ) -> Motion:
     """Smooth a flight with the navigator and take from it what identification needs.
 
@@ -126,8 +129,8 @@ def motion(
     density, sd = air_density(used, solution.config, t, -pos[:, 2], notes)
     air = _in_air(solution, t, vel, pos)
     seconds = float(np.sum(np.diff(t)[air[1:]])) if len(t) > 1 else 0.0
-    if seconds < LEAST:
-        raise HaltereError(f"at least {LEAST:g} s in the air", f"{seconds:.1f} s", name, "identify from a log that holds a flight")
+    if seconds < least:
+        raise HaltereError(f"at least {least:g} s in the air", f"{seconds:.1f} s", name, "identify from a log that holds a flight")
     return Motion(name, t, s.vector("q", "wxyz"), vel, pos, gyro, force, air, density, sd, used, solution, notes)
 
 
@@ -193,8 +196,11 @@ def air_density(flight: FlightLog, config: Config, t: FloatArray, height: FloatA
     return np.asarray(density), sd
 
 
-def samples(m: Motion, window: float = WINDOW) -> Samples:
-    """Means over windows that lie in the air as a whole; windows of less than half the usual number of samples are left out."""
+def samples(m: Motion, window: float = WINDOW, speed: FloatArray | None = None) -> Samples:
+    """Means over windows that lie in the air as a whole; windows of less than half the usual number of samples are left out.
+
+    ``speed`` is the sum of the rotor speeds at the IMU's samples, where it is known better than from the log's stamps.
+    """
     k = np.floor((m.t - m.t[0]) / window).astype(np.int64)
     n = int(k[-1]) + 1
     counts = np.bincount(k, minlength=n).astype(np.float64)
@@ -208,7 +214,7 @@ def samples(m: Motion, window: float = WINDOW) -> Samples:
 
     q = mean(_continuous(m.q_nb))
     q /= np.linalg.norm(q, axis=1)[:, None]
-    speed = rotor_sum(m)
+    speed = rotor_sum(m) if speed is None else speed
     gyro = mean(m.gyro_b)
     first, last = (np.full(n, -1) for _ in range(2))
     first[k[::-1]] = np.arange(len(k))[::-1]
@@ -216,7 +222,7 @@ def samples(m: Motion, window: float = WINDOW) -> Samples:
     a, b = first[keep], np.minimum(last[keep] + 1, len(k) - 1)
     turn = (m.gyro_b[b] - m.gyro_b[a]) / np.maximum(m.t[b] - m.t[a], 1e-6)[:, None]
     return Samples(
-        m.name, mean(m.t), _matrices(q), mean(m.vel_n), mean(m.pos_n), gyro, turn, mean(m.force_b), mean(m.density),
+        m.name, mean(m.t), matrices(q), mean(m.vel_n), mean(m.pos_n), gyro, turn, mean(m.force_b), mean(m.density),
         None if speed is None else mean(speed),
     )  # fmt: skip
 
@@ -244,7 +250,7 @@ def _continuous(q: FloatArray) -> FloatArray:
     return np.asarray(q * flips[:, None])
 
 
-def _matrices(q: FloatArray) -> FloatArray:
+def matrices(q: FloatArray) -> FloatArray:
     """C_nb (n, 3, 3) of unit quaternions (n, 4)."""
     w, x, y, z = q.T
     return np.stack([
