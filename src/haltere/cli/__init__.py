@@ -211,14 +211,28 @@ def _calibrate_magnetometer(
 
 @app.command(
     "identify",
-    short_help="The vehicle's drag from flights in wind.",
-    help="Identify a vehicle from its flights. --drag: the drag that the wind estimation of PX4 and ArduPilot needs (EKF2_MCOEF, "
+    short_help="The vehicle from its flights; --drag: in wind.",
+    help="Identify a vehicle from flights with rotor speeds: forces and moments with their uncertainty, to a vehicle file, tested on "
+    "flights not fitted. --drag needs no rotor speeds: the drag that the wind estimation of PX4 and ArduPilot needs (EKF2_MCOEF, "
     "EKF2_BCOEF_X/Y, EK3_DRAG_*) and haltere's own, jointly with the wind, with its uncertainty, ready to paste. Refused where the flights "
     "do not tell it.",
 )
 def _identify(
     logs: Annotated[list[Path], typer.Argument(metavar="LOG...", help="Logs or flight folders of one vehicle.", show_default=False)],
-    drag: Annotated[bool, typer.Option("--drag", help="Drag and wind.")] = False,
+    drag: Annotated[bool, typer.Option("--drag", help="Only drag and wind.")] = False,
+    preset: Annotated[str, typer.Option("--preset", metavar="P", help="Set of columns: full, rate or literal.")] = "full",
+    vehicle: Annotated[
+        str | None,
+        typer.Option("--vehicle", metavar="F", help="Vehicle file or name whose geometry is checked and used.", show_default=False),
+    ] = None,
+    validate: Annotated[
+        list[Path] | None,
+        typer.Option("--validate", metavar="LOG", help="A flight to predict, not fitted. May be repeated.", show_default=False),
+    ] = None,
+    still: Annotated[
+        bool | None,
+        typer.Option("--still/--windy", help="Take the air for still, or fit wind. Default: by the flight.", show_default=False),
+    ] = None,
     config: Annotated[
         Path | None, typer.Option("--config", metavar="F", help="Configuration file, as of a run.", show_default=False)
     ] = None,

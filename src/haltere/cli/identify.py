@@ -135,3 +135,94 @@ def _lines(d: DragIdentification, folder: Path) -> list[str]:
     out.append(f"use it: haltere run LOG --config {shlex.quote(str(folder / 'drag.toml'))}")
     out.append(f"page: {folder / 'drag.html'}")
     return out
+
+
+def vehicle(
+    logs: list[Path],
+    *,
+    preset: str,
+    vehicle: str | None,
+    validate: list[Path],
+    still: bool | None,
+    config: Path | None,
+    assignments: list[str],
+    out: Path | None,
+    columns: Path | None,
+    column: list[str] | None,
+    json: bool,
+    show: bool,
+) -> None:
+    """Identify forces and moments; write a vehicle file with ``[lumped]``, and a page and JSON of the same stem beside it.
+
+    Parameters
+    ----------
+    logs, validate
+        Logs to fit, and logs to predict.
+    preset, vehicle, still
+        As of `haltere.identify_vehicle`.
+    config, assignments
+        Configuration file and ``key=value`` texts over it, as of a run.
+    out
+        Vehicle file (``.toml``) or folder to write; default ``./<first log's stem>.haltere/vehicle.toml``.
+    columns, column
+        Column map, where the logs are single tables.
+    json
+        Print only the result, as JSON.
+    show
+        Open the page in the browser.
+
+    Raises
+    ------
+    HaltereError
+        A log cannot be read, navigated on or used, or a geometry that the flights contradict.
+    UsageError
+        Unknown preset, vehicle or key.
+    """
+    from haltere.flight import config as configuration
+
+    keys: dict[str, Any] = configuration.load(config)[2] if config is not None else {}
+    changes = dict(configuration.parse_assignment(text) for text in assignments)
+    configuration.resolve("navigator", "default", {**keys, **changes}, "--set")
+    mapped = column_map(columns, column)
+    target = Path(out) if out is not None else default_folder(logs[0])
+    file = target if target.suffix == ".toml" else target / "vehicle.toml"
+    words = ["haltere", "identify", *(str(log) for log in logs), "--preset", preset]
+    words += ["--vehicle", vehicle] if vehicle is not None else []
+    words += [word for log in validate for word in ("--validate", str(log))]
+    words += [] if still is None else ["--still" if still else "--windy"]
+    words += ["--config", str(config)] if config is not None else []
+    words += [word for text in assignments for word in ("--set", text)]
+    words += ["--columns", str(columns)] if columns is not None else []
+    words += [word for text in column or [] for word in ("--column", text)]
+    with Progress() as progress:
+        progress.stage("reading" if len(logs) == 1 else f"reading {len(logs)} logs")
+        from haltere.readers import read
+
+        flights, kept = [read(log, mapped) for log in logs], [read(log, mapped) for log in validate]
+        progress.stage("smoothing and fitting", compiles=True)
+        from haltere.identify.vehicle import identify_vehicle
+        from haltere.identify.vehicle_files import document, write
+        from haltere.report.vehicle_model import vehicle_page
+
+        d = identify_vehicle(flights, preset, vehicle=vehicle, validate=kept, still=still, config=keys, set=changes)
+        progress.stage("drawing the page")
+        page = file.with_suffix(".html")
+        write(d, file, {page.name: vehicle_page(d, shlex.join(words))})
+    if show:
+        import webbrowser
+
+        webbrowser.open(page.resolve().as_uri())
+    for note in d.notes:
+        print(f"note: {note}", file=sys.stderr)
+    if json:
+        print(json_.dumps(document(d), indent=1, allow_nan=False, ensure_ascii=False))
+        return
+    from haltere.vehicle.regressors import AXES, NAMES, PRESETS
+
+    for i, axis in enumerate(AXES):
+        found = [f"{NAMES[i][j]} {d.lumped.k[i, j]:.4g} ± {d.lumped.sd[i, j]:.2g}" for j in PRESETS[preset][i]]
+        print(f"{axis}: {', '.join(found)}; left {d.lumped.residual_sd[i]:.3g}")
+    for c in d.checks:
+        part = ", ".join(f"{a} {100.0 * e:.0f} %" for a, e in zip(AXES, c.explained, strict=True))
+        print(f"{'fitted' if c.seen else 'not fitted'} {c.name}: variance predicted {part}")
+    print(f"vehicle file: {file}\npage: {page}")

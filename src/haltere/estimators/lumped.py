@@ -28,7 +28,7 @@ class Lumped:
     preset
         ``literal``, ``rate`` or ``full``.
     roll, pitch, yaw
-        Weights of the rotors (n,): -y, x [m] and spin of a known geometry, else signs.
+        Weights of the rotors (n,): -y, x [m] and spin of a known geometry, else relative to their mean size.
     k
         Constants (6, 5) by axis hx, hy, t, r, p, q and column; 0 where the preset has none.
     covariance
@@ -111,15 +111,17 @@ def lumped_of(vehicle: Vehicle, where: str = "vehicle file") -> Lumped:
         k[i, list(used[i])] = [float(constants[n]) for n in names]
         block = np.asarray(table.get("covariance", {}).get(axis, np.zeros((len(names), len(names)))), dtype=np.float64)
         if block.shape != (len(names), len(names)) or not np.isfinite(block).all():
-            raise HaltereError(f"a covariance of {len(names)} by {len(names)} numbers", f"shape {block.shape}", f"{where} covariance.{axis}")
+            raise HaltereError(
+                f"a covariance of {len(names)} by {len(names)} numbers", f"shape {block.shape}", f"{where} covariance.{axis}"
+            )
         covariance[i][np.ix_(used[i], used[i])] = block
     if not np.isfinite(k).all():
         raise HaltereError("finite constants", "others", where)
-    statistics = [_vector(table, n, 6, where) for n in ("residual_sd", "residual_ar1", "residual_slow")]
+    sd, ar1, slow = (_vector(table, n, 6, where) for n in ("residual_sd", "residual_ar1", "residual_slow"))
     window = _vector(table, "window", 2, where)
     return Lumped(
-        preset, *weights, k, covariance, float(table.get("density", 1.225)), *statistics, (float(window[0]), float(window[1])),
-        float(table.get("lag", 0.0)), dict(table.get("valid", {})),
+        preset, weights[0], weights[1], weights[2], k, covariance, float(table.get("density", 1.225)), sd, ar1, slow,
+        (float(window[0]), float(window[1])), float(table.get("lag", 0.0)), dict(table.get("valid", {})),
     )  # fmt: skip
 
 

@@ -92,20 +92,22 @@ def find_lag(m: Motion, t: FloatArray, values: FloatArray) -> tuple[float, float
     """Lag of rotor speeds behind the IMU [s], and the part of roll and pitch acceleration that they explain there.
 
     The regression of the angular accelerations on the squares of the speeds, at lags within 0.1 s (theory-amendments.md 19: the top of a
-    correlation, with a parabola through it); it needs no geometry.
+    correlation, with a parabola through it); it needs no geometry. Rates are in it too: damping turns the phase as a lag does.
     """
     dt = max(float(np.median(np.diff(m.t))), 0.004)
     span = m.t[m.air]
     grid = np.arange(span[0] + REACH, span[-1] - REACH, dt)
     flying = np.interp(grid, m.t, m.air.astype(np.float64)) > 0.99
-    width = max(int(round(0.024 / dt)) | 1, 3)
+    width = max(round(0.024 / dt) | 1, 3)
     rate = np.column_stack([np.interp(grid, m.t, m.gyro_b[:, k]) for k in range(2)])
     y = _high(np.gradient(box(rate, width), dt, axis=0), dt)[flying]
+    damping = _high(box(rate, width), dt)[flying]
+    y -= damping @ np.linalg.lstsq(damping, y, rcond=None)[0]
     power = float(np.sum(y * y))
     lags = np.arange(-REACH, REACH + 0.5 * STEP, STEP)
     score = np.empty(len(lags))
     for k, lag in enumerate(lags):
-        x = _high(box(_read(t, values, grid + lag) ** 2, width), dt)[flying]
+        x = np.hstack([_high(box(_read(t, values, grid + lag) ** 2, width), dt)[flying], damping])
         left = y - x @ np.linalg.lstsq(x, y, rcond=None)[0]
         score[k] = 1.0 - float(np.sum(left * left)) / power
     best = int(np.argmax(score))
@@ -126,7 +128,7 @@ def box(x: FloatArray, width: int) -> FloatArray:
 
 def _high(x: FloatArray, dt: float) -> FloatArray:
     """Without what lasts longer than half a second."""
-    return x - box(x, int(round(0.5 / dt)) | 1)
+    return x - box(x, round(0.5 / dt) | 1)
 
 
 @dataclass
@@ -136,7 +138,7 @@ class Layout:
     Attributes
     ----------
     roll, pitch, yaw
-        Weights of the rotors (r,): of the geometry where it is given, else signs.
+        Weights of the rotors (r,): of the geometry where it is given, else what each was found to do over the mean size.
     effect, effect_sd
         Angular acceleration about each axis by each rotor's Ω² (3, r), and 1 sigma.
     found
@@ -176,7 +178,6 @@ def find_layout(
     r = len(geometry[0]) if geometry is not None else (blocks[0][1].shape[1] - 1)
     effect = np.array([f.k[:r] for f in fits])
     sd = np.array([f.sd[:r] for f in fits])
-    found = np.where(np.abs(effect) > CLEAR * sd, np.sign(effect), 0.0)
     # what a rotor does beside the mean of all is what tells it from the others: a tilted or shifted body gives all the same sign
     beside = effect - effect.mean(axis=1, keepdims=True)
     signs = np.where(np.abs(beside) > CLEAR * sd, np.sign(beside), 0.0)
@@ -184,12 +185,15 @@ def find_layout(
     if geometry is not None:
         given = np.array(geometry)
         _check(given, beside, sd, signs, notes)
-        return Layout(*given, effect, sd, signs, notes)
+        return Layout(geometry[0], geometry[1], geometry[2], effect, sd, signs, notes)
     if (signs == 0.0).any():
         axes = [name for name, row in zip(("roll", "pitch", "yaw"), signs, strict=True) if (row == 0.0).any()]
-        notes.append(f"the flights do not tell every rotor's part in {', '.join(axes)}: give the vehicle's geometry, or excite these axes more")
-    weights = np.where(signs == 0.0, np.sign(beside), signs)
-    notes.append("no geometry was given: rotors are weighted by the signs found, and kR0, kP0, kQ0 contain arms")
+        notes.append(
+            f"the flights do not tell every rotor's part in {', '.join(axes)}: give the vehicle's geometry, or excite these axes more"
+        )
+    # rotors, arms and mounts are not alike: each by what it was found to do, the mean of their sizes one
+    weights = effect / np.maximum(np.mean(np.abs(effect), axis=1, keepdims=True), 1e-300)
+    notes.append("no geometry was given: rotors are weighted by what each was found to do, and kR0, kP0, kQ0 contain arms")
     return Layout(weights[0], weights[1], weights[2], effect, sd, signs, notes)
 
 

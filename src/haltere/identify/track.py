@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from dataclasses import dataclass
 
 import numpy as np
@@ -20,7 +21,7 @@ BoolArray = NDArray[np.bool_]
 IntArray = NDArray[np.int64]
 
 #: Windows of force and of rate change [s], and stretches taken as independent [s].
-FORCE, MOMENT, STRETCH = 0.1, 0.2, 2.0
+FORCE, MOMENT, STRETCH = 0.1, 0.1, 1.0
 #: Below this part of its usual ΣΩ² a vehicle may be in a hand, or on the ground.
 LEAST_THRUST = 0.25
 
@@ -76,7 +77,7 @@ def flying(m: Motion, speeds: Speeds) -> BoolArray:
     """In the air and carried by its rotors."""
     s2 = np.sum(speeds.mean**2, axis=1)
     usual = float(np.percentile(s2[m.air], 75.0)) if m.air.any() else 0.0
-    carried = box((s2 > LEAST_THRUST * usual).astype(np.float64)[:, None], 2 * int(round(0.1 / _dt(m.t))) + 1)[:, 0] > 0.999
+    carried = box((s2 > LEAST_THRUST * usual).astype(np.float64)[:, None], 2 * round(0.1 / _dt(m.t)) + 1)[:, 0] > 0.999
     return np.asarray(m.air & carried)
 
 
@@ -99,10 +100,10 @@ def columns(tr: Track, speeds: FloatArray, weights: tuple[FloatArray, FloatArray
     record = as_records(np.zeros(1, lumped_layout(len(weights[0]))))
     record["roll"], record["pitch"], record["yaw"] = weights
     dt = _dt(m.t)
-    smooth = box(speeds, max(int(round(0.02 / dt)) | 1, 3))
+    smooth = box(speeds, max(round(0.02 / dt) | 1, 3))
     accelerations = np.gradient(smooth, m.t, axis=0)
     w = np.ascontiguousarray(m.gyro_b)
-    eta = np.gradient(box(w, max(int(round(0.02 / dt)) | 1, 3)), m.t, axis=0) if literal else w
+    eta = np.gradient(box(w, max(round(0.02 / dt) | 1, 3)), m.t, axis=0) if literal else w
     out = np.empty((len(m.t), 6, COLUMNS))
     regress(record, np.ascontiguousarray(speeds), np.ascontiguousarray(accelerations), np.ascontiguousarray(tr.v_air), w,
             np.ascontiguousarray(eta), out)  # fmt: skip
@@ -116,7 +117,7 @@ def runs(use: BoolArray, t: FloatArray) -> list[tuple[int, int]]:
     dt = _dt(t)
     breaks = np.flatnonzero(~use[1:] | ~use[:-1] | (np.diff(t) > 3.0 * dt)) + 1
     edges = np.r_[0, breaks, len(use)]
-    return [(int(a), int(b)) for a, b in zip(edges[:-1], edges[1:], strict=True) if b - a > 1 and use[a]]
+    return [(int(a), int(b)) for a, b in itertools.pairwise(edges) if b - a > 1 and use[a]]
 
 
 def force_windows(tr: Track, first: FloatArray, second: FloatArray, axis: int, used: tuple[int, ...], arm: FloatArray) -> Windows:
@@ -131,7 +132,7 @@ def _swing(m: Motion, arm: FloatArray) -> FloatArray:
     if not arm.any():
         return np.zeros_like(m.gyro_b)
     dt = _dt(m.t)
-    turn = np.gradient(box(m.gyro_b, max(int(round(0.02 / dt)) | 1, 3)), m.t, axis=0)
+    turn = np.gradient(box(m.gyro_b, max(round(0.02 / dt) | 1, 3)), m.t, axis=0)
     return np.asarray(np.cross(turn, arm) + np.cross(m.gyro_b, np.cross(m.gyro_b, arm)))
 
 
@@ -156,7 +157,7 @@ def moment_windows(tr: Track, first: FloatArray, second: FloatArray, axis: int) 
     """
     t, w = tr.t, tr.motion.gyro_b[:, axis]
     dt = _dt(t)
-    steps, width = max(int(round(MOMENT / dt)), 2), max(int(round(0.2 * MOMENT / dt)) | 1, 1)
+    steps, width = max(round(MOMENT / dt), 2), max(round(0.2 * MOMENT / dt) | 1, 1)
     parts: list[tuple[FloatArray, ...]] = []
     for low, high in runs(tr.use, t):
         if high - low < steps + width + 2:

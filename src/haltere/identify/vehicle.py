@@ -180,9 +180,7 @@ def identify_vehicle(
     return out
 
 
-def _identified(
-    motions: list[Motion], preset: str, given: Vehicle | None, still: bool | None, instruments: bool
-) -> VehicleIdentification:
+def _identified(motions: list[Motion], preset: str, given: Vehicle | None, still: bool | None, instruments: bool) -> VehicleIdentification:
     notes = list(dict.fromkeys(note for m in motions for note in m.notes))
     speeds = [speeds_of(m) for m in motions]
     for m, s in zip(motions, speeds, strict=True):
@@ -288,9 +286,8 @@ def _fit_axis(
         raise HaltereError(f"at least {5 * len(used)} windows in the air", f"{len(both.y)}", "identify", "give longer flights")
     precision = np.zeros(len(used))
     if axis == 2 and 3 in used:
-        precision[list(used).index(3)] = len(tracks) / OFFSET_SD**2 / max(float(np.var(both.y - both.x @ np.linalg.lstsq(both.x, both.y, rcond=None)[0])), 1e-6)
-        # in the units of the sum of squares: one over its own variance times that of what is left
-        precision[list(used).index(3)] = float(np.var(both.y - both.x @ np.linalg.lstsq(both.x, both.y, rcond=None)[0])) / OFFSET_SD**2
+        left = both.y - both.x @ np.linalg.lstsq(both.x, both.y, rcond=None)[0]
+        precision[list(used).index(3)] = float(np.var(left)) / OFFSET_SD**2  # in the unit of the sum of squares
     a, b = (both.a, both.b) if iv else (both.x, both.x)
     return instrumented(both.y, a, b, both.stretch, np.zeros(len(used)), precision)
 
@@ -366,12 +363,19 @@ def _with_residuals(model: Lumped, tracks: list[Track], first: list[FloatArray],
         every = np.concatenate(left)
         sd[axis] = float(np.sqrt(np.mean(every**2)))
         step = FORCE if axis < 3 else MOMENT
-        pairs = [(e[:-1][np.diff(t) < 1.5 * step], e[1:][np.diff(t) < 1.5 * step]) for e, t in zip(left, times, strict=True) if len(e) > 2]
+        near = [np.diff(t) < 1.5 * step for t in times]
+        pairs = [(e[:-1][n], e[1:][n]) for e, n in zip(left, near, strict=True)]
         ar1[axis] = float(sum(a @ b for a, b in pairs) / max(sum(0.5 * (a @ a + b @ b) for a, b in pairs), 1e-12))
-        seconds = [np.bincount(np.floor(t - t[0]).astype(np.int64), weights=e) / np.maximum(np.bincount(np.floor(t - t[0]).astype(np.int64)), 1)
-                   for e, t in zip(left, times, strict=True)]  # fmt: skip
+        seconds = [_by_second(t, e) for e, t in zip(left, times, strict=True)]
         slow[axis] = float(np.std(np.concatenate(seconds)))
     return replace(model, residual_sd=sd, residual_ar1=ar1, residual_slow=slow)
+
+
+def _by_second(t: FloatArray, e: FloatArray) -> FloatArray:
+    """Means of every second."""
+    k = np.floor(t - t[0]).astype(np.int64)
+    counts = np.bincount(k)
+    return np.asarray(np.bincount(k, weights=e)[counts > 0] / counts[counts > 0])
 
 
 def _kept(m: Motion, of: VehicleIdentification, still: bool | None) -> Track:

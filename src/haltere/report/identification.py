@@ -166,8 +166,8 @@ def _models(d: DragIdentification) -> Section:
     ]  # fmt: skip
     section = Section("models", "Models")
     section.note = (
-        "Each fitted by itself, with its own wind and colour of the noise. BIC, of whitened residuals, above the best: 10 is strong evidence. "
-        "The parameters to paste are not these of px4 and ardupilot but those with which their formulas come nearest "
+        "Each fitted by itself, with its own wind and colour of the noise. BIC, of whitened residuals, above the best: 10 is strong "
+        "evidence. The parameters to paste are not these of px4 and ardupilot but those with which their formulas come nearest "
         f"to the drag of {d.base.form}."
     )
     section.after = table(("model", "formula ", "parameters ", "BIC", "air taken for still"), rows)
