@@ -241,19 +241,23 @@ def _identify(
         typer.Option("--set", metavar="KEY=VALUE", help="One key, e.g. baro.temperature=293. May be repeated.", show_default=False),
     ] = None,
     out: Annotated[
-        Path | None, typer.Option("--out", metavar="DIR", help="Folder to write. Default: ./<log>.haltere", show_default=False)
+        Path | None,
+        typer.Option("--out", metavar="F", help="vehicle.toml, or folder. Default: ./<log>.haltere", show_default=False),
     ] = None,
     columns: Columns = None,
     column: Column = None,
     json: Json = False,
     open_: Open = False,
 ) -> None:
-    from haltere.cli.identify import drag as identify_drag
-    from haltere.errors import UsageError
+    from haltere.cli import identify
 
-    if not drag:
-        raise UsageError("what to identify: --drag", "nothing", "identify")
-    identify_drag(logs, config=config, assignments=set_ or [], out=out, columns=columns, column=column, json=json, show=open_)
+    if drag:
+        identify.drag(logs, config=config, assignments=set_ or [], out=out, columns=columns, column=column, json=json, show=open_)
+        return
+    identify.vehicle(
+        logs, preset=preset, vehicle=vehicle, validate=validate or [], still=still, config=config, assignments=set_ or [], out=out,
+        columns=columns, column=column, json=json, show=open_,
+    )  # fmt: skip
 
 
 @app.command(

@@ -18,8 +18,8 @@ FloatArray = NDArray[np.float64]
 
 #: How far apart in time rotors and IMU may be [s], the step of the search [s], and the part of the rates' variance that must be explained.
 REACH, STEP, TOLD = 0.1, 0.002, 0.15
-#: Lowest sample rate of rotor speeds that tells moments [Hz].
-LEAST_RATE = 20.0
+#: Lowest sample rate of rotor speeds that tells anything, and that tells moments [Hz].
+LEAST_RATE, MOMENT_RATE = 8.0, 40.0
 #: Windows of moments [s], and within how many sigma a sign is believed.
 WINDOW, CLEAR = 0.2, 4.0
 
@@ -41,6 +41,7 @@ class Speeds:
     lag: float
     lag_told: bool
     explained: float
+    rate: float
 
     @property
     def mean(self) -> FloatArray:
@@ -85,7 +86,7 @@ def speeds_of(m: Motion, lag: float | None = None) -> Speeds:
     told = explained > TOLD
     found = found if told else 0.0
     at = m.t + found
-    return Speeds(_read(t[::2], values[::2], at), _read(t[1::2], values[1::2], at), found, told, explained)
+    return Speeds(_read(t[::2], values[::2], at), _read(t[1::2], values[1::2], at), found, told, explained, rate)
 
 
 def find_lag(m: Motion, t: FloatArray, values: FloatArray) -> tuple[float, float]:
@@ -164,8 +165,8 @@ def find_layout(
     Parameters
     ----------
     blocks
-        By axis r, p, q: rate changes (n,), both readings of the columns (n, r + 2) - integrals of every rotor's Ω², of the product of
-        the other rates, and the change of every rotor's speed for q - and stretches.
+        By axis r, p, q: rate changes (n,), both readings of the columns - integrals of every rotor's Ω², and of what else turns a vehicle -
+        and stretches.
     geometry
         Weights -y, x and spin of the rotors.
 
@@ -175,16 +176,17 @@ def find_layout(
         The geometry contradicts the flights, and in which order it would not.
     """
     fits: list[Instrumented] = [instrumented(*block) for block in blocks]
-    r = len(geometry[0]) if geometry is not None else (blocks[0][1].shape[1] - 1)
+    r = blocks[2][1].shape[1] // 2 - 1  # of q: every rotor's square and its change, two more
     effect = np.array([f.k[:r] for f in fits])
     sd = np.array([f.sd[:r] for f in fits])
     # what a rotor does beside the mean of all is what tells it from the others: a tilted or shifted body gives all the same sign
     beside = effect - effect.mean(axis=1, keepdims=True)
-    signs = np.where(np.abs(beside) > CLEAR * sd, np.sign(beside), 0.0)
+    clear = np.array([_explained(f, block) > 0.5 for f, block in zip(fits, blocks, strict=True)])
+    signs = np.where((np.abs(beside) > CLEAR * sd) & clear[:, None], np.sign(beside), 0.0)
     notes: list[str] = []
     if geometry is not None:
         given = np.array(geometry)
-        _check(given, beside, sd, signs, notes)
+        _check(given, _borne_out(blocks, fits, given), beside, sd, signs, notes)
         return Layout(geometry[0], geometry[1], geometry[2], effect, sd, signs, notes)
     if (signs == 0.0).any():
         axes = [name for name, row in zip(("roll", "pitch", "yaw"), signs, strict=True) if (row == 0.0).any()]
@@ -197,13 +199,38 @@ def find_layout(
     return Layout(weights[0], weights[1], weights[2], effect, sd, signs, notes)
 
 
-def _check(given: FloatArray, beside: FloatArray, sd: FloatArray, signs: FloatArray, notes: list[str]) -> None:
+def _explained(f: Instrumented, block: tuple[FloatArray, FloatArray, FloatArray, NDArray[np.int64]]) -> float:
+    """Part of the variance of rate changes that the rotors explain; where it is little, noise decides."""
+    y, a, b, _ = block
+    return 1.0 - float(np.var(y - 0.5 * (a + b) @ f.k) / max(float(np.var(y)), 1e-300))
+
+
+def _borne_out(
+    blocks: list[tuple[FloatArray, FloatArray, FloatArray, NDArray[np.int64]]], fits: list[Instrumented], given: FloatArray
+) -> list[bool]:
+    """Whether each axis' weights do nearly as well as rotors each for itself, with the right sign: then they are not contradicted.
+
+    Rotors each for itself are hardly told from each other where a flight swings about one axis only.
+    """
+    out = []
+    r = given.shape[1]
+    for (y, a, b, stretch), f, weights in zip(blocks, fits, given, strict=True):
+        M = np.zeros((a.shape[1], 1 + a.shape[1] - r))
+        M[:r, 0] = weights
+        M[r:, 1:] = np.eye(a.shape[1] - r)
+        block = (y, a @ M, b @ M, stretch)
+        own = instrumented(*block)
+        out.append(bool(own.k[0] > 0.0 and _explained(own, block) > 0.8 * _explained(f, (y, a, b, stretch))))
+    return out
+
+
+def _check(given: FloatArray, borne: list[bool], beside: FloatArray, sd: FloatArray, signs: FloatArray, notes: list[str]) -> None:
     """Compare a geometry with what was found; contradicted, the permutation and spin that agree are named."""
     from itertools import permutations
 
     centred = given - given.mean(axis=1, keepdims=True)
     expected = np.sign(np.where(np.abs(centred) > 1e-6, centred, 0.0))
-    wrong = (expected != 0.0) & (signs != 0.0) & (expected != signs)
+    wrong = (expected != 0.0) & (signs != 0.0) & (expected != signs) & ~np.array(borne)[:, None]
     if not wrong.any():
         told = int(np.sum((expected != 0.0) & (signs == expected)))
         notes.append(f"the geometry agrees with the flights: {told} of {int(np.sum(expected != 0.0))} signs told, none against")

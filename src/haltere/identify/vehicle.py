@@ -19,7 +19,7 @@ from haltere.identify.drag import LEAST_SPREAD
 from haltere.identify.fitting import WIND_SD, Result, fit
 from haltere.identify.instrument import Instrumented, instrumented
 from haltere.identify.prepare import Motion, Samples, motion, samples
-from haltere.identify.rotors import Layout, Speeds, find_layout, speeds_of
+from haltere.identify.rotors import MOMENT_RATE, Layout, Speeds, find_layout, speeds_of
 from haltere.identify.track import FORCE, MOMENT, Track, Windows, columns, flying, force_windows, moment_windows, track
 from haltere.vehicle.regressors import AXES, COLUMNS, NAMES, PRESETS
 
@@ -29,6 +29,8 @@ FloatArray = NDArray[np.float64]
 
 #: Least time in the air of a flight [s]; mean wind of air said to be still [m/s]; offset of the force along z before the flight [m/s^2].
 LEAST, STILL_SD, OFFSET_SD = 3.0, 0.02, 0.1
+#: Spread of the force along z below which thrust is said not to change [m/s^2].
+LEAST_THRUST_SPREAD = 0.5
 #: Sigma of a constant below which it is said not to be told.
 TOLD = 2.0
 
@@ -133,7 +135,7 @@ def identify_vehicle(
     Parameters
     ----------
     flights
-        Logs of one vehicle, with rotor speeds at 20 Hz or more.
+        Logs of one vehicle, with rotor speeds at 40 Hz or more; from 8 Hz on the thrust is told.
     preset
         Set of columns: ``full``, ``rate`` or ``literal`` (`haltere.vehicle.regressors`).
 
@@ -187,6 +189,8 @@ def _identified(motions: list[Motion], preset: str, given: Vehicle | None, still
         m.air = flying(m, s)
         said = f"{1e3 * s.lag:.1f} ms" if s.lag_told else "not told by the flight, taken for none"
         notes.append(f"{m.name}: lag of the rotor speeds {said} (they explain {100.0 * s.explained:.0f} % of quick roll and pitch)")
+        if s.rate < MOMENT_RATE:
+            notes.append(f"{m.name}: {s.rate:.0f} rotor speeds a second are too few for moments ({MOMENT_RATE:g} wanted): believe only t")
     windows = [samples(m, FORCE, np.sum(s.mean, axis=1)) for m, s in zip(motions, speeds, strict=True)]
     calm = _calm(windows, still, notes)
     used = PRESETS[preset]
@@ -205,7 +209,7 @@ def _identified(motions: list[Motion], preset: str, given: Vehicle | None, still
     first = [columns(tr, tr.speeds.first, weights, preset == "literal") for tr in tracks]
     second = [columns(tr, tr.speeds.second, weights, preset == "literal") for tr in tracks]
     for axis in range(2, 6):
-        found = _fit_axis(axis, used[axis], tracks, first, second, arm, instruments)
+        found = _fit_axis(axis, used[axis], tracks, first, second, arm, instruments, notes)
         j = np.array(used[axis])
         k[axis, j], plain[axis, j], condition[axis] = found.k, found.plain, found.condition
         cov[axis][np.ix_(j, j)] = found.covariance
@@ -257,8 +261,11 @@ def _layout(tracks: list[Track], given: Vehicle | None) -> Layout:
             cross = w[:, (axis + 1) % 3] * w[:, (axis + 2) % 3]
             readings = []
             for reading in (tr.speeds.first, tr.speeds.second):
-                extra = [np.gradient(reading, tr.t, axis=0)] if axis == 2 else []
-                readings.append(np.column_stack([reading**2 * tr.ratio[:, None], cross, *extra]))
+                if axis == 2:
+                    extra = [np.gradient(reading, tr.t, axis=0)]
+                else:
+                    extra = [reading.sum(axis=1) * tr.v_air[:, 1 - axis]]
+                readings.append(np.column_stack([reading**2 * tr.ratio[:, None], cross, w[:, axis], *extra]))
             parts.append(moment_windows(tr, readings[0], readings[1], axis))
         both = _joined(parts)
         blocks.append((both.y, both.a, both.b, both.stretch))
@@ -273,7 +280,14 @@ def _joined(parts: list[Windows]) -> Windows:
 
 
 def _fit_axis(
-    axis: int, used: tuple[int, ...], tracks: list[Track], first: list[FloatArray], second: list[FloatArray], arm: FloatArray, iv: bool
+    axis: int,
+    used: tuple[int, ...],
+    tracks: list[Track],
+    first: list[FloatArray],
+    second: list[FloatArray],
+    arm: FloatArray,
+    iv: bool,
+    notes: list[str],
 ) -> Instrumented:
     parts = []
     for tr, a, b in zip(tracks, first, second, strict=True):
@@ -284,12 +298,31 @@ def _fit_axis(
     both = _joined(parts)
     if len(both.y) < 5 * len(used):
         raise HaltereError(f"at least {5 * len(used)} windows in the air", f"{len(both.y)}", "identify", "give longer flights")
-    precision = np.zeros(len(used))
-    if axis == 2 and 3 in used:
-        left = both.y - both.x @ np.linalg.lstsq(both.x, both.y, rcond=None)[0]
-        precision[list(used).index(3)] = float(np.var(left)) / OFFSET_SD**2  # in the unit of the sum of squares
+    sd = _thought(axis, tracks)[list(used)]
+    left = both.y - both.x @ np.linalg.lstsq(both.x, both.y, rcond=None)[0]
+    # in the unit of the sum of squares; what is left lasts, so that a stretch counts as one sample
+    precision = float(np.var(left)) * len(both.y) / len(np.unique(both.stretch)) / sd**2
+    if axis == 2 and float(np.std(both.y)) < LEAST_THRUST_SPREAD:
+        precision[[n for n, j in enumerate(used) if j == 3]] = 1e12  # of a thrust that never changes no offset is told
+        notes.append("thrust hardly changed: kT0 is thrust over speed squared, the offset kT3 is taken for none")
     a, b = (both.a, both.b) if iv else (both.x, both.x)
     return instrumented(both.y, a, b, both.stretch, np.zeros(len(used)), precision)
+
+
+def _thought(axis: int, tracks: list[Track]) -> FloatArray:
+    """1 sigma of the constants of an axis before the flights (5,): wide, but no hover may find a thrust that does not carry.
+
+    An offset of the force is the accelerometer's; products of rates are ratios of inertias, below one; the rest is given as damping
+    [1/s] or acceleration at the speeds flown.
+    """
+    speeds = np.concatenate([tr.speeds.mean[tr.use] for tr in tracks])
+    s1, s2 = float(np.mean(speeds.sum(axis=1))), float(np.mean((speeds**2).sum(axis=1)))
+    free = 1e6
+    if axis == 2:
+        return np.array([free, 0.05, 1.0 / s1, OFFSET_SD, free])
+    if axis < 5:
+        return np.array([free, 1.0, 3.0, 10.0 / s2, 2.0 / s1])
+    return np.array([free, 1.0, 3.0, free, 10.0 / s2])
 
 
 def _across(r: Result, preset: str, k: FloatArray, cov: FloatArray, plain: FloatArray) -> tuple[FloatArray, FloatArray]:
