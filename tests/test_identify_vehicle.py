@@ -263,8 +263,25 @@ def test_a_damaged_table_is_one_clear_error(identified: VehicleIdentification, c
         lumped_of(load_vehicle("iris"))
 
 
+def without_speeds(flight: FlightLog) -> FlightLog:
+    rotors = {k: v for k, v in flight["rotors"].columns.items() if not k.startswith("speed_")}
+    return FlightLog({**flight.streams, "rotors": rotors}, flight.meta)
+
+
+def test_commands_where_there_is_no_telemetry(identified: VehicleIdentification) -> None:
+    """The motor of the simulation: speed in proportion to command and voltage, 12.5 ms up and 25 ms down."""
+    other = without_speeds(flown("lissajous", seed=8))
+    d = identify_vehicle(without_speeds(flown("identify")), vehicle="iris", validate=other, set=TEMPERATURE)
+    assert d.motor is not None
+    assert 0.01 < d.motor.tau < 0.06
+    assert any("modelled from commands" in n for n in d.notes)
+    assert d.checks[-1].explained[2] > 0.8
+    assert (d.checks[-1].error[2:] > 0.9 * identified.checks[-1].error[2:]).all()  # telemetry is not worse
+    assert tomllib.loads(to_toml(d))["lumped"]["motor"]["tau"] == d.motor.tau
+
+
 def test_logs_that_cannot_tell(excited: FlightLog) -> None:
-    with pytest.raises(HaltereError, match="rotor speeds"):
+    with pytest.raises(HaltereError, match="rotor speeds, or commands"):
         identify_vehicle(excited.without("rotors"))
     slow = excited["rotors"].where(slice(None, None, 50))
     with pytest.raises(HaltereError, match="rotor speeds a second"):

@@ -12,7 +12,7 @@ from haltere.flight.log import Stream
 from haltere.identify.instrument import Instrumented, instrumented
 from haltere.identify.prepare import Motion
 
-__all__ = ["Layout", "Speeds", "box", "find_lag", "find_layout", "speeds_of"]
+__all__ = ["Layout", "Speeds", "box", "find_lag", "find_layout", "quick_turns", "speeds_of"]
 
 FloatArray = NDArray[np.float64]
 
@@ -95,6 +95,17 @@ def find_lag(m: Motion, t: FloatArray, values: FloatArray) -> tuple[float, float
     The regression of the angular accelerations on the squares of the speeds, at lags within 0.1 s (theory-amendments.md 19: the top of a
     correlation, with a parabola through it); it needs no geometry. Rates are in it too: damping turns the phase as a lag does.
     """
+    lags, score = quick_turns(m, t, values, np.arange(-REACH, REACH + 0.5 * STEP, STEP))
+    best = int(np.argmax(score))
+    if 0 < best < len(lags) - 1:
+        before, top, after = score[best - 1 : best + 2]
+        shift = 0.5 * (before - after) / min(before - 2.0 * top + after, -1e-12)
+        return float(lags[best] + STEP * np.clip(shift, -1.0, 1.0)), float(score[best])
+    return float(lags[best]), 0.0  # at the edge: not a top
+
+
+def quick_turns(m: Motion, t: FloatArray, values: FloatArray, lags: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Lags, and the part of quick roll and pitch acceleration that the squares of speeds (n, r) at times t explain at each."""
     dt = max(float(np.median(np.diff(m.t))), 0.004)
     span = m.t[m.air]
     grid = np.arange(span[0] + REACH, span[-1] - REACH, dt)
@@ -105,18 +116,12 @@ def find_lag(m: Motion, t: FloatArray, values: FloatArray) -> tuple[float, float
     damping = _high(box(rate, width), dt)[flying]
     y -= damping @ np.linalg.lstsq(damping, y, rcond=None)[0]
     power = float(np.sum(y * y))
-    lags = np.arange(-REACH, REACH + 0.5 * STEP, STEP)
     score = np.empty(len(lags))
     for k, lag in enumerate(lags):
         x = np.hstack([_high(box(_read(t, values, grid + lag) ** 2, width), dt)[flying], damping])
         left = y - x @ np.linalg.lstsq(x, y, rcond=None)[0]
         score[k] = 1.0 - float(np.sum(left * left)) / power
-    best = int(np.argmax(score))
-    if 0 < best < len(lags) - 1:
-        before, top, after = score[best - 1 : best + 2]
-        shift = 0.5 * (before - after) / min(before - 2.0 * top + after, -1e-12)
-        return float(lags[best] + STEP * np.clip(shift, -1.0, 1.0)), float(score[best])
-    return float(lags[best]), 0.0  # at the edge: not a top
+    return lags, score
 
 
 def box(x: FloatArray, width: int) -> FloatArray:

@@ -15,15 +15,17 @@ from haltere.estimators.lumped import Lumped
 from haltere.flight.config import Config
 from haltere.flight.log import FlightLog
 from haltere.flight.vehicle import Vehicle, load_vehicle
+from haltere.identify.checks import Check, check, with_residuals
 from haltere.identify.drag import LEAST_SPREAD
 from haltere.identify.fitting import WIND_SD, Result, fit
 from haltere.identify.instrument import Instrumented, instrumented
+from haltere.identify.motor import FULL, Motor, commands_of, fit_motor, modelled
 from haltere.identify.prepare import Motion, Samples, motion, samples
 from haltere.identify.rotors import MOMENT_RATE, Layout, Speeds, find_layout, speeds_of
 from haltere.identify.track import FORCE, MOMENT, Track, Windows, columns, flying, force_windows, moment_windows, track
 from haltere.vehicle.regressors import AXES, COLUMNS, NAMES, PRESETS
 
-__all__ = ["Check", "VehicleIdentification", "identify_vehicle"]
+__all__ = ["VehicleIdentification", "identify_vehicle"]
 
 FloatArray = NDArray[np.float64]
 
@@ -33,35 +35,6 @@ LEAST, STILL_SD, OFFSET_SD = 3.0, 0.02, 0.1
 LEAST_THRUST_SPREAD = 0.5
 #: Sigma of a constant below which it is said not to be told.
 TOLD = 2.0
-
-
-@dataclass
-class Check:
-    """Measured against predicted on one flight, by axis hx, hy, t, r, p, q (6,).
-
-    Attributes
-    ----------
-    name
-        Of the flight, and whether the model has seen it.
-    signal, error
-        Root mean square of the measured about its mean, and of measured minus predicted [m/s^2, rad/s^2].
-    bias
-        Mean of measured minus predicted.
-    windows
-        Times, measured and predicted of each axis, for a picture.
-    """
-
-    name: str
-    seen: bool
-    signal: FloatArray
-    error: FloatArray
-    bias: FloatArray
-    windows: list[tuple[FloatArray, FloatArray, FloatArray]]
-
-    @property
-    def explained(self) -> FloatArray:
-        """Part of the variance that is predicted, bias counted as error (6,)."""
-        return np.asarray(1.0 - self.error**2 / np.maximum(self.signal**2, 1e-12))
 
 
 @dataclass
@@ -90,6 +63,8 @@ class VehicleIdentification:
         The flights fitted; then flights kept back, or each flight predicted from the others.
     tracks, notes
         What was fitted, and sentences on what was assumed and found.
+    motor
+        The motor model, where rotor speeds are from commands.
     """
 
     lumped: Lumped
@@ -104,6 +79,7 @@ class VehicleIdentification:
     checks: list[Check]
     tracks: list[Track]
     notes: list[str] = field(default_factory=list)
+    motor: Motor | None = None
 
     @property
     def name(self) -> str:
@@ -114,6 +90,9 @@ class VehicleIdentification:
         """The vehicle with this model; constants are per mass and inertia, which flights alone do not tell."""
         v = self.vehicle
         table = self.lumped.table()
+        if self.motor is not None:
+            table["motor"] = {"full": FULL, "linear": self.motor.a, "tau": self.motor.tau}
+            table["motor"] |= {} if np.isnan(self.motor.voltage) else {"voltage": self.motor.voltage}
         if v is None:
             return Vehicle("identified", 1.0, (1.0, 1.0, 1.0, 0.0, 0.0, 0.0), lumped=table)
         return Vehicle(v.name, v.mass, v.inertia, v.rotors, v.drag, v.density, v.battery, table)
@@ -170,13 +149,13 @@ def identify_vehicle(
     back = [motion(log.without("onboard", "truth"), config, set, LEAST) for log in kept]
     out = _identified(motions, preset, given, still, instruments)
     model = out.lumped
-    out.checks = [_check(tr, model, out.arm, True) for tr in out.tracks]
+    out.checks = [check(tr, model, out.arm, True) for tr in out.tracks]
     if back:
-        out.checks += [_check(_kept(m, out, still), model, out.arm, False) for m in back]
+        out.checks += [check(_kept(m, out, still), model, out.arm, False) for m in back]
     elif len(motions) > 1:
         for k, m in enumerate(motions):
             rest = _identified([o for i, o in enumerate(motions) if i != k], preset, given, still, instruments)
-            out.checks.append(_check(_kept(m, rest, still), rest.lumped, rest.arm, False))
+            out.checks.append(check(_kept(m, rest, still), rest.lumped, rest.arm, False))
     else:
         out.notes.append("one flight: nothing was kept back to test the model on; give more logs, or --validate")
     return out
@@ -184,7 +163,8 @@ def identify_vehicle(
 
 def _identified(motions: list[Motion], preset: str, given: Vehicle | None, still: bool | None, instruments: bool) -> VehicleIdentification:
     notes = list(dict.fromkeys(note for m in motions for note in m.notes))
-    speeds = [speeds_of(m) for m in motions]
+    motor = _motor(motions, notes)
+    speeds = [_speeds(m, motor) for m in motions]
     for m, s in zip(motions, speeds, strict=True):
         m.air = flying(m, s)
         said = f"{1e3 * s.lag:.1f} ms" if s.lag_told else "not told by the flight, taken for none"
@@ -222,12 +202,35 @@ def _identified(motions: list[Motion], preset: str, given: Vehicle | None, still
         preset, *weights, k, cov, 1.225, np.zeros(6), np.zeros(6), np.zeros(6), (FORCE, MOMENT),
         float(np.median([s.lag for s in speeds])), _valid(tracks),
     )  # fmt: skip
-    lumped = _with_residuals(lumped, tracks, first, second, arm)
+    lumped = with_residuals(lumped, tracks, arm)
     told = np.abs(k) > TOLD * lumped.sd
     missing = [NAMES[i][j] for i in range(6) for j in used[i] if not told[i, j] and not (i < 3 and j == len(NAMES[i]) - 1)]
     if missing:
         notes.append(f"not told from none (2 sigma): {', '.join(missing)}; fly faster, climb, and swing about each axis to tell more")
-    return VehicleIdentification(lumped, given, layout, plain, condition, told, across, arm, arm_sd, [], tracks, notes)
+    return VehicleIdentification(lumped, given, layout, plain, condition, told, across, arm, arm_sd, [], tracks, notes, motor)
+
+
+def _motor(motions: list[Motion], notes: list[str]) -> Motor | None:
+    """The motor model, where a flight has no rotor speeds; one for all, since their unit is another."""
+    known = [any(c.startswith("speed_") for c in m.flight["rotors"].names) for m in motions if "rotors" in m.flight]
+    if len(known) == len(motions) and all(known):
+        return None
+    motor = fit_motor(motions)
+    volts = "" if np.isnan(motor.voltage) else f" at {motor.voltage:.1f} V"
+    notes.append(
+        f"no rotor speeds: modelled from commands, {100.0 * motor.a:.0f} % of thrust linear in them, lag {1e3 * motor.tau:.0f} ms; "
+        f"a full command{volts} counts as {FULL:g} rad/s. They explain {100.0 * motor.explained[0]:.0f} % of the force along z and "
+        f"{100.0 * motor.explained[1]:.0f} % of quick roll and pitch; constants are in that unit"
+    )
+    return motor
+
+
+def _speeds(m: Motion, motor: Motor | None) -> Speeds:
+    """Rotor speeds of a flight, from telemetry or from commands."""
+    if motor is None:
+        return speeds_of(m)
+    values = modelled(m, motor.a, motor.tau)
+    return Speeds(values, values, 0.0, True, motor.explained[1], commands_of(m)[2])
 
 
 def _calm(windows: list[Samples], still: bool | None, notes: list[str]) -> bool:
@@ -367,63 +370,11 @@ def _valid(tracks: list[Track]) -> dict[str, Any]:
     }  # fmt: skip
 
 
-def _predicted(tr: Track, model: Lumped, arm: FloatArray) -> list[tuple[FloatArray, FloatArray, FloatArray]]:
-    """Times, measured and predicted by axis, in windows of force [m/s^2] and of rate change over their length [rad/s^2]."""
-    weights = (model.roll, model.pitch, model.yaw)
-    x = columns(tr, tr.speeds.mean, weights, model.preset == "literal")
-    out = []
-    for axis in range(6):
-        used = PRESETS[model.preset][axis]
-        k = model.k[axis, list(used)]
-        if axis < 3:
-            w = force_windows(tr, x, x, axis, used, arm)
-            out.append((w.t, w.y, w.x @ k))
-        else:
-            w = moment_windows(tr, x[:, axis][:, list(used)], x[:, axis][:, list(used)], axis - 3)
-            out.append((w.t, w.y / MOMENT, w.x @ k / MOMENT))
-    return out
-
-
-def _with_residuals(model: Lumped, tracks: list[Track], first: list[FloatArray], second: list[FloatArray], arm: FloatArray) -> Lumped:
-    """The model with the statistics of what it leaves on its own flights."""
-    from dataclasses import replace
-
-    sd, ar1, slow = np.zeros(6), np.zeros(6), np.zeros(6)
-    shown = [_predicted(tr, model, arm) for tr in tracks]
-    for axis in range(6):
-        left = [s[axis][1] - s[axis][2] for s in shown]
-        times = [s[axis][0] for s in shown]
-        every = np.concatenate(left)
-        sd[axis] = float(np.sqrt(np.mean(every**2)))
-        step = FORCE if axis < 3 else MOMENT
-        near = [np.diff(t) < 1.5 * step for t in times]
-        pairs = [(e[:-1][n], e[1:][n]) for e, n in zip(left, near, strict=True)]
-        ar1[axis] = float(sum(a @ b for a, b in pairs) / max(sum(0.5 * (a @ a + b @ b) for a, b in pairs), 1e-12))
-        seconds = [_by_second(t, e) for e, t in zip(left, times, strict=True)]
-        slow[axis] = float(np.std(np.concatenate(seconds)))
-    return replace(model, residual_sd=sd, residual_ar1=ar1, residual_slow=slow)
-
-
-def _by_second(t: FloatArray, e: FloatArray) -> FloatArray:
-    """Means of every second."""
-    k = np.floor(t - t[0]).astype(np.int64)
-    counts = np.bincount(k)
-    return np.asarray(np.bincount(k, weights=e)[counts > 0] / counts[counts > 0])
-
-
 def _kept(m: Motion, of: VehicleIdentification, still: bool | None) -> Track:
     """A flight that was not fitted, its wind from itself."""
-    speeds: Speeds = speeds_of(m)
+    speeds = _speeds(m, of.motor)
     m.air = flying(m, speeds)
     w = samples(m, FORCE, np.sum(speeds.mean, axis=1))
     if _calm([w], still, []):
         return track(m, speeds, w, np.zeros((len(w.t), 2)))
     return track(m, speeds, w, fit("lumped", [w], of.across.free).parts[0].wind_path)
-
-
-def _check(tr: Track, model: Lumped, arm: FloatArray, seen: bool) -> Check:
-    windows = _predicted(tr, model, arm)
-    signal = np.array([float(np.std(y)) for _, y, _ in windows])
-    error = np.array([float(np.sqrt(np.mean((y - p) ** 2))) for _, y, p in windows])
-    bias = np.array([float(np.mean(y - p)) for _, y, p in windows])
-    return Check(tr.motion.name, seen, signal, error, bias, windows)

@@ -65,7 +65,7 @@ def to_toml(d: VehicleIdentification) -> str:
     first = f"# Identified from {d.name} by haltere {__version__}; [lumped] is per mass and inertia\n".replace("\r", " ")
     if d.vehicle is not None:
         return first + d.as_vehicle().to_toml()
-    return first + tomli_w.dumps({"name": "identified", "lumped": d.lumped.table()})
+    return first + tomli_w.dumps({"name": "identified", "lumped": dict(d.as_vehicle().lumped)})
 
 
 def write(d: VehicleIdentification, file: str | Path, extra: Mapping[str, str] | None = None) -> Path:

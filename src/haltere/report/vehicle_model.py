@@ -5,8 +5,9 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from haltere.identify.checks import Check
 from haltere.identify.track import FORCE, MOMENT
-from haltere.identify.vehicle import Check, VehicleIdentification
+from haltere.identify.vehicle import VehicleIdentification
 from haltere.identify.vehicle_files import to_toml
 from haltere.report.document import document
 from haltere.report.markup import Section, escape, section_html, table
