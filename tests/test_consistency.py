@@ -109,7 +109,7 @@ def test_the_band_catches_sensors_worse_than_the_filter_is_told() -> None:
 def test_nees_of_50_flights_is_inside_the_band() -> None:
     """Every block inside the 99.9 % χ² band of 50 independent flights (samples of one flight are not independent)."""
     nees, nis = _mean_nees(50, 500)
-    assert set(nees) == set(DOF)
+    assert set(nees) == set(DOF) - {"wind"}  # nothing in these flights feels the air
     for block, value in nees.items():
         low, high = band(DOF[block], 50.0, 0.999)
         assert low < value < high, (block, value, low, high)

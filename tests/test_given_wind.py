@@ -146,6 +146,16 @@ def test_tables_that_cannot_be_used_say_why(columns: dict, start: str | None, ma
         haltere.with_wind(flight(start), columns)
 
 
+@pytest.mark.parametrize(
+    "data", [b"", b"\n", b"t,north\n", b"PAR1 and nothing", b"\x00\xff\xfe", b"t,north,east\n1,2\n", b"t,north,east\n1,2,3,4\n"]
+)
+def test_broken_files_are_one_clear_error(tmp_path: Path, data: bytes) -> None:
+    path = tmp_path / "broken.csv"
+    path.write_bytes(data)
+    with pytest.raises(HaltereError, match="expected"):
+        haltere.with_wind(flight(), path)
+
+
 def test_the_stream_survives_a_flight_folder(tmp_path: Path) -> None:
     from haltere.flight.folder import read_folder, write_folder
 

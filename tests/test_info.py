@@ -212,3 +212,25 @@ def test_convert_says_what_was_discarded(tmp_path: Path, capsys: pytest.CaptureF
 def test_info_on_nothing(tmp_path: Path) -> None:
     with pytest.raises(HaltereError, match="nothing there"):
         info(tmp_path / "no.ulg")
+
+
+def test_what_feels_the_air_is_named_and_its_absence_is_no_lack() -> None:
+    flight = _flight()
+    t, one = flight["gnss"].t, np.ones(len(flight["gnss"]))
+    speeds = {"t": t} | {f"speed_{k}": 500.0 * one for k in range(4)}
+    commands = {"t": t} | {f"command_{k}": 0.4 * one for k in range(3)} | {"command_3": 0.0 * one}
+    pitot = {"t": t, "airspeed": 15.0 * one}
+    for streams_, said in (
+        ({"rotors": speeds}, "wind from the drag of 4 rotors"),
+        ({"rotors": commands}, "wind from the drag of 3 rotors"),
+        ({"airdata": pitot}, "wind from the airspeed"),
+        ({"airdata": pitot | {"aoa": 0.1 * one, "sideslip": 0.0 * one}}, "wind from the airspeed and vanes"),
+        ({"rotors": {"t": t, "speed_0": 500.0 * one}}, None),
+        ({}, None),
+    ):
+        found = {s.estimator: s for s in support(FlightLog({**flight.streams, **streams_}, flight.meta))}
+        assert [c for c in found["navigator"].can if c.startswith("wind")] == ([said] if said else [])
+        assert found["navigator"].verdict == "yes"
+        assert not any("wind" in c for c in found["ahrs"].can)
+    blind = FlightLog({**flight.without("gnss").streams, "rotors": speeds}, flight.meta)
+    assert not any("wind" in c for s in support(blind) for c in s.can)

@@ -120,6 +120,19 @@ def test_held_empty_and_broken_cells(tmp_path: Path) -> None:
     assert flight.discarded["imu"]["row without a time"] == 1
 
 
+def test_wind_is_where_it_blows_to_and_nothing_before_it_is_estimated(tmp_path: Path) -> None:
+    header = HEADER + "".join(f",IMU_ATTI(0):{c}" for c in ("roll", "pitch", "yaw", "velN", "velE", "velD", "Latitude", "Longitude"))
+    header += ",Wind:velocity,Wind:direction,Wind:fromDir"
+    rows = [f"{k},{k / 100:.2f},{k * 1e-6},0,-1,0,0,{k},1,2,{3 + k * 0.01},0,0,0,47,8,{4 if k > 50 else 0},90,270" for k in range(100)]
+    onboard = _table(tmp_path / "a.csv", header, rows)["onboard"]
+    known = np.isfinite(onboard["wind_e"])
+    assert known.any() and not known[:50].any()
+    np.testing.assert_allclose(onboard["wind_e"][known], 4.0)
+    np.testing.assert_allclose(onboard["wind_n"][known], 0.0, atol=1e-12)
+    still = _table(tmp_path / "b.csv", header, [r.replace(",4,90,", ",0,90,") for r in rows])
+    assert "wind_n" not in still["onboard"]
+
+
 def test_what_cannot_be_read_is_one_clear_error(tmp_path: Path) -> None:
     for name, text in (("a", HEADER), ("b", HEADER + "\n0,,0,0,0,0,0,0"), ("c", "offsetTime,IMU_ATTI(0):accel:X\n1,\n")):
         (tmp_path / f"{name}.csv").write_text(text + "\n")

@@ -20,17 +20,18 @@ def flown(mission: str, duration: float = 60.0, north: float = 4.0, east: float 
     """A simulated flight in wind and its solution without any wind."""
     wind = {"n": north, "e": east, "gust": gust, "shear": shear}
     flight = simulate(Scenario(name=mission, mission=mission, duration=duration, seed=3, wind=wind))
-    return flight, drive.run(flight, rate=20.0)
+    return flight, drive.run(flight, rate=20.0, set={"aid.drag": "off", "aid.airdata": "off"})
 
 
 def with_wind(
-    flight: FlightLog, solution: Solution, *, sd: float = 0.4, prior: float = 5.0, seconds: float = 10.0, seed: int = 1,
+    flight: FlightLog, solution: Solution, *, sd: float = 0.4, prior: float = 5.0, seconds: float = 4.0, seed: int = 1,
     sensor: str = "drag", nis: float = 1.0, mu: tuple[float, float] | None = (0.15, 0.02), scale: float = 1.0,
+    drift: float = 1.0,
 ) -> Solution:  # fmt: skip
     """The solution with the true wind plus a slow error of ``scale`` times the stated 1 sigma, which falls from ``prior`` to ``sd`` [m/s].
 
     ``sensor`` is what its aid records say felt the air, with innovations of a mean square of ``nis``; ``mu`` the relative 1 sigma of the
-    drag coefficient at the start and at the end.
+    drag coefficient at the start and at the end, and ``drift`` the factor by which it moves.
     """
     rng = np.random.default_rng(seed)
     t, truth = solution.t, flight["truth"]
@@ -42,8 +43,8 @@ def with_wind(
         table[f"sd_wind_{a}"] = stated
     if mu is not None:
         relative = np.sqrt(mu[1] ** 2 + (mu[0] ** 2 - mu[1] ** 2) * np.exp(-(t - t[0]) / seconds))
-        table["drag_mu"] = 0.4 * (1.0 + 0.5 * relative)
-        table["sd_drag_mu"] = 0.4 * relative
+        table["drag_mu"] = 0.4 * (1.0 + 0.5 * relative) * drift ** ((t - t[0]) / (t[-1] - t[0]))
+        table["sd_drag_mu"] = table["drag_mu"] * relative
     at = t[::4]
     n = len(at)
     made = {

@@ -1,7 +1,7 @@
 """What all measurements of moving air have in common: the wind, the velocity through the air, the rows they share. It measures nothing.
 
-A row of the air has five blocks, see `haltere.filter.update`: attitude, velocity, accelerometer bias, wind (with the state after it,
-where the wind is horizontal) and what else the measurement depends on.
+A row of the air has five blocks, see `haltere.filter.update`: attitude, velocity, accelerometer bias, wind (with ln µ, which
+follows it in a layout with drag) and what else the measurement depends on.
 
 In a layout with drag the state is not the wind W but A = µW + c|W|W, the specific force that it has on a vehicle at hover. There drag
 measures A, whatever µ and c are. With W as the state, the direction that stays unobserved, of more wind and less drag, would turn with
@@ -26,11 +26,11 @@ __all__ = [
     "AirOffer",
     "AirRow",
     "air_velocity",
-    "by_quadratic",
     "calm",
     "core_blocks",
     "memory",
     "moves",
+    "quadratic_block",
     "single",
     "wind_block",
     "wind_covariance",
@@ -130,25 +130,27 @@ def core_blocks(C: Mat, v_a: Vec, d: Vec) -> tuple[Block, Block, Vec]:
 
 
 @jit
-def wind_block(s: Any, e: Vec, after: float) -> Block:
+def wind_block(s: Any, e: Vec, by_mu: float) -> Block:
     """Block of the wind of a measurement with ∂h/∂v = e.
 
-    ``after`` is the derivative against the state after a horizontal wind, at a constant wind: ln µ, else the airspeed's scale.
+    ``by_mu`` is the derivative against ln µ at a constant wind.
     """
     o = 15 + len(s.baro) + len(s.mag)
     if len(s.drag) > 0:
         n, east = wind_rows(s, wind_n(s))
-        return (o, (-e[0] * n[0] - e[1] * east[0], -e[0] * n[1] - e[1] * east[1], after - e[0] * n[2] - e[1] * east[2]))
+        return (o, (-e[0] * n[0] - e[1] * east[0], -e[0] * n[1] - e[1] * east[1], by_mu - e[0] * n[2] - e[1] * east[2]))
     if len(s.wind) == 3:
         return (o, (-e[0], -e[1], -e[2]))
-    return (o, (-e[0], -e[1], after))
+    return (o, (-e[0], -e[1], 0.0))
 
 
 @jit
-def by_quadratic(s: Any, e: Vec) -> float:
-    """What a measurement with ∂h/∂v = e changes with ln c by way of the wind."""
+def quadratic_block(s: Any, e: Vec) -> Block:
+    """Block of ln c of a measurement with ∂h/∂v = e: what it changes by way of the wind, where the state is its force."""
+    if len(s.drag) == 0:
+        return NONE
     n, east = wind_rows(s, wind_n(s))
-    return -e[0] * n[3] - e[1] * east[3]
+    return (15 + len(s.baro) + len(s.mag) + 1, (0.0, 0.0, -e[0] * n[3] - e[1] * east[3]))
 
 
 @jit

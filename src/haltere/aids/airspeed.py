@@ -6,12 +6,11 @@ import math
 from typing import Any
 
 from haltere._jit import jit
-from haltere.aids.air import SILENT, AirOffer, air_velocity, core_blocks, memory, moves, single, wind_block
+from haltere.aids.air import SILENT, AirOffer, air_velocity, core_blocks, memory, moves, quadratic_block, single, wind_block
 from haltere.aids.fusing import ONE, RUNNING
 from haltere.aids.record import AIRSPEED, C_AIRSPEED, R_NONE
 from haltere.core.rotation import dcm, norm
 from haltere.filter.robust import IGG3
-from haltere.filter.update import NONE
 
 __all__ = ["offer"]
 
@@ -33,10 +32,7 @@ def offer(s: Any, prm: Any, m: Any) -> AirOffer:
     h = k * speed
     theta, vel, e = core_blocks(C, v_a, (k * v_a[0] / speed, k * v_a[1] / speed, k * v_a[2] / speed))
     o = 15 + len(s.baro) + len(s.mag) + len(s.wind) + len(s.drag) + len(s.steady)
-    after, scale = 0.0, single(o, h)
-    if len(s.wind) == 2 and len(s.drag) == 0:
-        after, scale = h, NONE
-    row = (theta, vel, NONE, wind_block(s, e, after), scale)
+    row = (theta, vel, quadratic_block(s, e), wind_block(s, e, 0.0), single(o, h))
     r = m.r[0] if m.r[0] >= 0.0 else prm.noise_airspeed * prm.noise_airspeed
     shared = memory(s, AIRSPEED, m.t, prm.noise_airdata_time)
     z = (m.z[0], 0.0, 0.0)

@@ -12,12 +12,13 @@ from typing import Any
 
 from haltere._jit import constant, jit
 from haltere.aids import rest
-from haltere.aids.air import SILENT, AirOffer, air_velocity, by_quadratic, core_blocks, moves, wind_block
-from haltere.aids.fusing import RUNNING
+from haltere.aids.air import SILENT, AirOffer, air_velocity, calm, core_blocks, moves, wind_block, wind_rows
+from haltere.aids.fusing import ANY_TURN, NO_GATE, ONLY_AIR, ONLY_WIND, RUNNING, WITH_DRAG
 from haltere.aids.record import C_DRAG, DRAG, R_NONE
 from haltere.core.earth import STANDARD_DENSITY, density
-from haltere.core.rotation import Vec, dcm, norm, quat_unit
-from haltere.filter.robust import IGG3
+from haltere.core.rotation import Vec, dcm, dot, norm, quat_unit, tmat_vec
+from haltere.filter.robust import PLAIN
+from haltere.filter.update import project, variance
 from haltere.strapdown.layout import BA
 
 __all__ = ["airborne", "density_ratio", "drag_force", "forget", "gather", "hear", "offer", "spin"]
@@ -28,6 +29,11 @@ LEAST_THRUST = 0.3
 LIFTED, FAST = 1.5, 2.0
 #: How long a rotor speed is believed [s], and how slowly its proportion to thrust is followed [samples at 10 Hz].
 STALE, FOLLOW = 0.5, 200
+#: Innovations beyond so many sigma are a step of the wind.
+STEPPED = 3.5
+#: Drag is learnt from motion faster than this [m/s], and by no other measurement: what a vehicle that hovers makes of gusts moves with
+#: them, and would be taken for less drag.
+LEARNT = 2.0
 TWO = constant(2)
 
 
@@ -134,27 +140,57 @@ def offer(s: Any, prm: Any) -> AirOffer:
     speed = norm(v_a)
     drag = drag_force(v_a, mu, c)
     h = (drag[0] + s.drag[2] + s.ba[0], drag[1] + s.drag[3] + s.ba[1], 0.0)
-    first, second = _row(s, C, v_a, speed, mu, c, 0), _row(s, C, v_a, speed, mu, c, 1)
+    n, e = calm(s.steady[0], s.steady[1], math.exp(s.drag[0]), math.exp(s.drag[1]))
+    v_c = tmat_vec(C, (0.5 * (s.v[0] + a.v[0]) - n, 0.5 * (s.v[1] + a.v[1]) - e, 0.5 * (s.v[2] + a.v[2])))
+    by_c = _by_c(s, C, v_c, (n, e, 0.0), mu, c)
+    first, second = _row(s, C, v_a, speed, mu, c, by_c[0], 0), _row(s, C, v_a, speed, mu, c, by_c[1], 1)
     r = prm.noise_drag * prm.noise_drag
     shared = max(1.0, 2.0 * prm.noise_drag_time / dt)
-    robust = (IGG3, 2.5, 1.0, shared)
-    return (
-        TWO,
-        C_DRAG,
-        (f[0], f[1], 0.0),
-        h,
-        (r, r, 1.0),
-        (first, second, second),
-        prm.gate_air,
-        prm.timeout_air,
-        R_NONE,
-        moves(s, prm),
-        robust,
-    )
+    robust = (PLAIN, NO_GATE, 1.0, shared)
+    alone, slow = moves(s, prm) == ONLY_AIR, s.v[0] * s.v[0] + s.v[1] * s.v[1] < LEARNT * LEARNT
+    turn = (ONLY_WIND if slow else ONLY_AIR) if alone else (ANY_TURN if slow else WITH_DRAG)
+    z = (f[0], f[1], 0.0)
+    widen(s, first, second, (f[0] - h[0], f[1] - h[1]), r)
+    rows = (first, second, second)
+    return TWO, C_DRAG, z, h, (r, r, 1.0), rows, prm.gate_drag, prm.timeout_drag, R_NONE, turn, robust
 
 
 @jit
-def _row(s: Any, C: tuple[Vec, Vec, Vec], v_a: Vec, speed: float, mu: float, c: float, axis: int) -> Any:
+def widen(s: Any, first: Any, second: Any, e: tuple[float, float], r: float) -> None:
+    """Let wind and mean wind go where drag says when an innovation is beyond what gusts explain: the wind has stepped.
+
+    The innovation's own square is added to their variances, as of one change of both.
+    """
+    project(s, first)
+    beyond = e[0] * e[0] > STEPPED * STEPPED * (variance(s, first) + r)
+    project(s, second)
+    beyond = beyond or e[1] * e[1] > STEPPED * STEPPED * (variance(s, second) + r)
+    if beyond:
+        P, o = s.P, 15 + len(s.baro) + len(s.mag)
+        m, more = o + len(s.wind) + len(s.drag), e[0] * e[0] + e[1] * e[1]
+        for i in range(2):
+            P[o + i, o + i] += more
+            P[m + i, m + i] += more
+            P[o + i, m + i] += more
+            P[m + i, o + i] += more
+
+
+@jit
+def _by_c(s: Any, C: tuple[Vec, Vec, Vec], v_a: Vec, W: Vec, mu: float, c: float) -> tuple[float, float]:
+    """Derivatives of drag along body x and y against ln c at a constant A, in the mean wind ``W``.
+
+    In the wind as it is just estimated they would follow the noise that the innovation holds too, and c would be found from that.
+    """
+    speed = norm(v_a)
+    n, e = wind_rows(s, W)
+    u = tmat_vec(C, (n[3], e[3], 0.0))
+    k = c * dot(v_a, u) / max(speed, 1e-6)
+    along = mu + c * speed
+    return along * u[0] + k * v_a[0] - c * speed * v_a[0], along * u[1] + k * v_a[1] - c * speed * v_a[1]
+
+
+@jit
+def _row(s: Any, C: tuple[Vec, Vec, Vec], v_a: Vec, speed: float, mu: float, c: float, by_c: float, axis: int) -> Any:
     """Row of drag along a body axis (0: x, 1: y), see `haltere.aids.air`."""
     k = c * v_a[axis] / max(speed, 1e-6)
     on = -mu - c * speed
@@ -162,5 +198,5 @@ def _row(s: Any, C: tuple[Vec, Vec, Vec], v_a: Vec, speed: float, mu: float, c: 
     theta, vel, e = core_blocks(C, v_a, d)
     x, y = (1.0, 0.0) if axis == 0 else (0.0, 1.0)
     o = 15 + len(s.baro) + len(s.mag) + len(s.wind)
-    coefficients = (o + 1, (-c * speed * v_a[axis] + by_quadratic(s, e), x, y))
+    coefficients = (o + 1, (by_c, x, y))
     return (theta, vel, (BA, (x, y, 0.0)), wind_block(s, e, -mu * v_a[axis]), coefficients)

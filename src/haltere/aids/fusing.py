@@ -35,6 +35,8 @@ __all__ = [
     "NO_TURN",
     "ONLY_AIR",
     "ONLY_TURN",
+    "ONLY_WIND",
+    "WITH_DRAG",
     "Offer",
     "Robust",
     "fuse_offer",
@@ -51,8 +53,9 @@ Offer = tuple[int, int, Vec, Vec, Vec, tuple[Row, Row, Row], float, float, int, 
 #: and how many successive samples share one error (1: none): a factor on r that no test sees.
 Robust = tuple[int, float, float, float]
 
-#: The gain as it is, only its turn about the vertical, all but that, or only what it does to wind and what air data depend on.
-ANY_TURN, ONLY_TURN, NO_TURN, ONLY_AIR = (constant(i) for i in (0, 1, 2, 3))
+#: The gain as it is, only its turn about the vertical, all but that, only what it does to the wind and what air data depend on, that
+#: without the coefficients of drag, or all with these: no other code moves them, see `haltere.aids.drag`.
+ANY_TURN, ONLY_TURN, NO_TURN, ONLY_AIR, ONLY_WIND, WITH_DRAG = (constant(i) for i in (0, 1, 2, 3, 4, 5))
 
 #: No robust weight: all up to the gate.
 HARD = (PLAIN, 1e9, 1.0, 1.0)
@@ -163,16 +166,26 @@ def fuse_offer(s: Any, aids: Any, t: float, sensor: int, offer: Any) -> None:
                 row, r_i, e_i, ok = H2, r[2], e[2], ok2
             if ok:
                 optimal_gain(s, row, r_i)
-                if turn == ONLY_AIR:
-                    for k in range(15 + len(s.baro) + len(s.mag)):
-                        s.k[k] = 0.0
-                elif turn != ANY_TURN:
+                if len(s.wind) > 0:
+                    mask_air(s, turn)
+                if turn in (ONLY_TURN, NO_TURN):
                     project_gain(s, turn == ONLY_TURN)
                 apply(s, row, r_i, innovation(s, row, e_i))
         inject(s)
     for i in range(n):
         if z[i] == z[i]:
             record(s, aids, t, sensor, component + i, z[i], e[i], math.sqrt(s_ii[i]), ratio, weight, status, reason)
+
+
+@jit
+def mask_air(s: Any, turn: int) -> None:
+    """Keep of the gain in ``s.k`` what the codes from `ONLY_AIR` on say; the coefficients of drag are the two states after the wind."""
+    o = 15 + len(s.baro) + len(s.mag)
+    if turn in (ONLY_AIR, ONLY_WIND):
+        for i in range(o):
+            s.k[i] = 0.0
+    if len(s.drag) > 0 and turn not in (ONLY_AIR, WITH_DRAG):
+        s.k[o + len(s.wind)], s.k[o + len(s.wind) + 1] = 0.0, 0.0
 
 
 @jit

@@ -6,7 +6,7 @@ import math
 from typing import Any
 
 from haltere._jit import constant, jit
-from haltere.aids.air import SILENT, AirOffer, air_velocity, core_blocks, memory, moves, single, wind_block
+from haltere.aids.air import SILENT, AirOffer, air_velocity, core_blocks, memory, moves, quadratic_block, single, wind_block
 from haltere.aids.fusing import ONE, RUNNING
 from haltere.aids.record import AIRSPEED, C_AOA, C_SIDESLIP, R_NONE, VANES
 from haltere.core.rotation import Vec, dcm, norm
@@ -52,9 +52,9 @@ def offer(s: Any, prm: Any, m: Any) -> AirOffer:
     beta, db = sideslip(v_a)
     o = 15 + len(s.baro) + len(s.mag) + len(s.wind) + len(s.drag) + len(s.steady)
     theta, vel, e = core_blocks(C, v_a, da)
-    first = (theta, vel, NONE, wind_block(s, e, 0.0), single(o + 1, 1.0))
+    first = (theta, vel, quadratic_block(s, e), wind_block(s, e, 0.0), single(o + 1, 1.0))
     theta, vel, e = core_blocks(C, v_a, db)
-    second = (theta, vel, NONE, wind_block(s, e, 0.0), single(o + 2, 1.0))
+    second = (theta, vel, quadratic_block(s, e), wind_block(s, e, 0.0), single(o + 2, 1.0))
     slow = prm.noise_airspeed / speed
     shared = memory(s, VANES, m.t, prm.noise_airdata_time)
     r = (prm.noise_aoa * prm.noise_aoa + slow * slow, prm.noise_sideslip * prm.noise_sideslip + slow * slow, 1.0)
@@ -73,7 +73,7 @@ def offer_no_sideslip(s: Any, prm: Any) -> AirOffer:
         return SILENT
     beta, d = sideslip(v_a)
     theta, vel, e = core_blocks(C, v_a, d)
-    row = (theta, vel, NONE, wind_block(s, e, 0.0), NONE)
+    row = (theta, vel, quadratic_block(s, e), wind_block(s, e, 0.0), NONE)
     r = prm.noise_no_sideslip * prm.noise_no_sideslip
     shared = max(1.0, 2.0 * prm.noise_airdata_time / 0.2)
     z = (0.0, 0.0, 0.0)

@@ -39,7 +39,7 @@ def _errors(what: str, rows: dict[str, dict[str, float]]) -> list[str]:
 
 def lines(solution: Solution, flight: FlightLog, folder: Path) -> list[str]:
     """The summary for people."""
-    from haltere.report.words import verdict_of
+    from haltere.report.words import verdict_of, wind_in_words
 
     summary = solution.summary
     said = verdict_of(solution, flight)
@@ -54,6 +54,8 @@ def lines(solution: Solution, flight: FlightLog, folder: Path) -> list[str]:
         out.append("smoothed over the whole run: smoothed.parquet")
         for name, rows in summary["smoothed"]["errors"].items():
             out += _errors("smoothed: error against truth" if name == "truth" else f"smoothed: difference from {name}", rows)
+    if summary.get("wind"):
+        out.append(f"wind: {': '.join(w for w in (wind_in_words(summary['wind']), summary['wind']['verdict']) if w)}")
     if summary["health"]:
         out.append("health: " + ", ".join(f"{sensor} {h['verdict']}" for sensor, h in summary["health"].items()))
     for event in [e for e in solution.events if e["kind"] != "aligned"][:8]:

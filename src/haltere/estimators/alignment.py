@@ -203,15 +203,15 @@ def start_air(s: Any, prm: Any, o: int) -> None:
         P[k, k] = sd * sd
         scale = prm.drag_mu
     for i in range(len(s.wind)):
-        sd = scale * (prm.init_wind if i < 2 else prm.init_wind_d)
+        gust = scale * prm.wind_gust
         s.wind[i] = 0.0
-        P[o + i, o + i] = sd * sd
+        P[o + i, o + i] = gust * gust if i < 2 else 0.25 * gust * gust
     for i in range(len(s.steady)):  # all that is known of the wind before any is felt is known of its mean
-        k = o + len(s.wind) + len(s.drag) + i
+        k, sd = o + len(s.wind) + len(s.drag) + i, scale * prm.init_wind
         s.steady[i] = 0.0
-        P[k, k] = P[o + i, o + i]
-        P[o + i, k], P[k, o + i] = P[k, k], P[k, k]
-        P[o + i, o + i] += scale * scale * prm.wind_gust * prm.wind_gust
+        P[k, k] = sd * sd
+        P[o + i, o + i] += sd * sd
+        P[o + i, k], P[k, o + i] = sd * sd, sd * sd
     for i in range(len(s.vane)):
         k = o + len(s.wind) + len(s.drag) + len(s.steady) + i
         sd = prm.init_airspeed_scale if i == 0 else prm.init_vane

@@ -219,7 +219,7 @@ def _of_the_air(checked: Checked, config: Config) -> list[Part]:
         add(AIRSPEED, airdata.t, airdata.get("airspeed")[:, None])
         if config["aid.vanes"] == "on":
             vanes = np.column_stack([airdata.get("aoa"), airdata.get("sideslip")])
-            add(VANES, airdata.t, np.where(np.isfinite(vanes).all(axis=1)[:, None], vanes, np.nan))
+            add(VANES, airdata.t, np.where(np.isfinite(vanes.sum(axis=1, keepdims=True)), vanes, np.nan))
     wind, attitude = checked.streams.get("wind"), checked.streams.get("attitude")
     if wind is not None and config["aid.wind"] == "on" and "on" in (config["aid.drag"], config["aid.airdata"]):
         add(WIND, wind.t, wind.vector("wind", "ned"), _variances(wind, "sd", "sd", "sd"))

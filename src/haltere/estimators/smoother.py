@@ -45,7 +45,7 @@ from haltere.estimators.step import (
     write_wind_covariance,
 )
 from haltere.strapdown.optional import put_optional
-from haltere.strapdown.propagate import left_F, mechanise, propagate, transition
+from haltere.strapdown.propagate import gust_keeps, left_F, mechanise, propagate, transition, unseen
 
 __all__ = ["BUFFER", "node_width", "smooth", "smoothed"]
 
@@ -131,9 +131,25 @@ def step_forward(s: Any, prm: Any, w: Any, k: int, w0: Vec, f0: Vec, w1: Vec, f1
             w.phi[k, 0, i, j], w.phi[k, 1, i, j], w.phi[k, 2, i, j] = D[i][j], A[i][j], B[i][j]
     w.dt[k] = dt
     propagate(s, prm, C, D, A, B, dt)
+    if prm.imu_mean == 0.0:
+        unseen(s, prm, w0, f0, w1, f1, dt)
     m = w.W.shape[0]
     for j in range(m):
         left_F(w.system, m + j, D, A, B, dt)
+    if len(s.steady) > 0:
+        o, keep = first_of_wind(s), gust_keeps(prm, dt)
+        c = o + len(s.wind) + len(s.drag)
+        for i in range(len(s.wind)):
+            for j in range(m):
+                w.system.P[o + i, m + j] *= keep
+                if i < 2:
+                    w.system.P[o + i, m + j] += (1.0 - keep) * w.system.P[c + i, m + j]
+
+
+@jit
+def first_of_wind(s: Any) -> int:
+    """First error state of the wind."""
+    return 15 + len(s.baro) + len(s.mag)
 
 
 @jit
@@ -172,8 +188,8 @@ def forward(s: Any, prm: Any, w: Any, t: Any, gyro: Any, accel: Any, a: int, b: 
 
 
 @jit
-def back(w: Any, k: int) -> None:
-    """μ <- Φᵀ μ over the k-th prediction; the blocks of Φ as in `haltere.strapdown.propagate.left_F`."""
+def back(s: Any, prm: Any, w: Any, k: int) -> None:
+    """μ <- Φᵀ μ over the k-th prediction; the blocks of Φ as in `haltere.strapdown.propagate.left_F` and `blow`."""
     f, dt, u = w.phi[k], w.dt[k], w.mu
     t0, t1, t2 = u[0], u[1], u[2]
     p0, p1, p2 = u[6], u[7], u[8]
@@ -187,6 +203,13 @@ def back(w: Any, k: int) -> None:
     u[9] -= dt * t0
     u[10] -= dt * t1
     u[11] -= dt * t2
+    if len(s.steady) > 0:
+        o, keep = first_of_wind(s), gust_keeps(prm, dt)
+        c = o + len(s.wind) + len(s.drag)
+        for i in range(len(s.wind)):
+            if i < 2:
+                u[c + i] += (1.0 - keep) * u[o + i]
+            u[o + i] *= keep
 
 
 @jit
@@ -303,7 +326,7 @@ def smooth(
                     w.first[i, c] = w.P[0, i, c]
             continue
         for k in range(count - 1, -1, -1):
-            back(w, k)
+            back(s, prm, w, k)
             if w.row[k] >= 0:
                 corrected(w, k)
                 blend(w, k, (t[w.row[k]] - t[a]) / (t[b] - t[a]), whole or column[w.row[k]] >= 0)

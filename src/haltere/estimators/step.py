@@ -30,7 +30,7 @@ from haltere.core.rotation import Vec, cross, dcm, mat_vec, quat_from_rotvec, qu
 from haltere.estimators import alignment, yaw_bank
 from haltere.filter.queue import pop_imu, push, push_imu
 from haltere.strapdown.optional import get_optional
-from haltere.strapdown.propagate import predict
+from haltere.strapdown.propagate import predict, unseen
 
 __all__ = [
     "ASSUMED",
@@ -55,7 +55,7 @@ __all__ = [
 #: triangle of the wind's covariance.
 COVARIANCE_ROWS = 1 + 5 * 6 + 1 + 6
 #: Longest interval [s] bridged in one step, and longest gap [s] bridged at all.
-LONG_STEP, SUB_STEP = 0.1, 0.05
+LONG_STEP, SUB_STEP = 0.12, 0.06
 #: A tape for smoothing has a node after each fusion, at least after so many predictions, and about every so many seconds.
 NODE_STEPS, NODE_SPAN = 64, 0.05
 #: What a node says of itself: a stretch begins, it follows a prediction, or only assumptions that tell the past nothing came before it.
@@ -223,6 +223,8 @@ def predict_interval(s: Any, prm: Any, w0: Vec, f0: Vec, w1: Vec, f1: Vec, dt: f
     """Predict over one interval between raw IMU samples, see `interval`."""
     w, f, rotation, dv = interval(s, prm, w0, f0, w1, f1, dt)
     predict(s, prm, w, f, rotation, dv, dt)
+    if prm.imu_mean == 0.0:
+        unseen(s, prm, w0, f0, w1, f1, dt)
 
 
 @jit

@@ -85,6 +85,12 @@ KEYS: dict[str, Key] = {
     "noise.gyro_scale": Key(
         0.005, "1", "Gyro error in proportion to the rate (scale, misalignment), 1 sigma, taken as noise that lasts a second.", low=0.0
     ),
+    "noise.between": Key(
+        0.2,
+        "1",
+        "Share of the change between two IMU samples that the mean between them may be off by, 1 sigma. It matters at low rates.",
+        low=0.0,
+    ),
     "noise.accel": _positive(0.035, "m/s^2/sqrt(Hz)", "Accelerometer white noise density, vibration included."),
     "noise.gyro_bias": _positive(1e-4, "rad/s/sqrt(s)", "Walk of the gyro bias."),
     "noise.accel_bias": _positive(3e-4, "m/s^2/sqrt(s)", "Walk of the accelerometer bias."),
@@ -110,14 +116,10 @@ KEYS: dict[str, Key] = {
         "m/s",
         "Fake velocity of ahrs, 1 sigma at 5 Hz: worth 2 m/s that last a second. Lower trusts gravity more, accelerations less.",
     ),
-    "noise.wind": _positive(
-        0.3, "m/s/sqrt(s)", "Walk of the horizontal wind that air data show. Higher follows gusts sooner, and is less sure."
-    ),
-    "noise.wind_mean": _positive(0.05, "m/s/sqrt(s)", "Walk of the mean wind of a multirotor, which gusts return to."),
-    "wind.gust": _positive(0.3, "m/s", "Gusts of a multirotor's wind, 1 sigma in calm air."),
+    "noise.wind_mean": _positive(0.05, "m/s/sqrt(s)", "Walk of the mean wind, which gusts return to."),
+    "wind.gust": _positive(0.3, "m/s", "Gusts, 1 sigma an axis in calm air; vertical ones are half of it."),
     "wind.turbulence": Key(0.2, "1", "Gusts more in proportion to the mean wind.", low=0.0, high=2.0),
     "wind.gust_time": _positive(3.0, "s", "How long a gust lasts."),
-    "noise.wind_d": _positive(0.1, "m/s/sqrt(s)", "Walk of the vertical wind."),
     "noise.air_walk": _positive(
         2e-3, "1/sqrt(s)", "Walk of what air data depend on: relative for drag and airspeed scale, in m/s^2 and rad for offsets."
     ),
@@ -132,7 +134,8 @@ KEYS: dict[str, Key] = {
     "noise.attitude": _positive(1.0 * DEG, "rad", "Roll and pitch told from outside, 1 sigma."),
     "noise.attitude_yaw": _positive(2.0 * DEG, "rad", "Yaw told from outside, 1 sigma."),
     "noise.attitude_time": Key(1.0, "s", "How long the errors of a told attitude last.", low=0.0),
-    "gate.air": _positive(5.0, "sigma", "Innovation gate of airspeed, vanes, drag and told wind."),
+    "gate.air": _positive(5.0, "sigma", "Innovation gate of airspeed, vanes and told wind."),
+    "gate.drag": _positive(15.0, "sigma", "The same of drag: wide, since wind may well step."),
     "gate.attitude": _positive(5.0, "sigma", "Innovation gate of a told attitude."),
     "gate.gnss": _positive(5.0, "sigma", "Innovation gate of GNSS position and velocity, joint over the components."),
     "gate.barometer": _positive(5.0, "sigma", "Innovation gate of the barometer."),
@@ -193,6 +196,7 @@ KEYS: dict[str, Key] = {
     "drag.c_sd": _positive(0.7, "1", "Its relative 1 sigma, log-normal."),
     "drag.offset_sd": _positive(0.1, "m/s^2", "1 sigma of what the thrust's axis is askew to the accelerometer's: 0.1 is 0.6 deg."),
     "timeout.air": _positive(10.0, "s", "The same for measurements of the air."),
+    "timeout.drag": _positive(2.0, "s", "The same for drag."),
     "timeout.attitude": _positive(10.0, "s", "The same for a told attitude."),
     "timeout.gnss": _positive(7.0, "s", "After this long without a fix that passes, GNSS is let in again by force, at the gate's edge."),
     "timeout.barometer": _positive(7.0, "s", "The same for the barometer."),
@@ -240,7 +244,6 @@ KEYS: dict[str, Key] = {
     "init.baro_bias": _positive(3.0, "m", "1 sigma of the barometer offset."),
     "init.mag_offset": _positive(5.0, "uT", "1 sigma of the magnetometer's offset, where it is estimated."),
     "init.wind": _positive(5.0, "m/s", "1 sigma of each component of the horizontal wind, which begins at none."),
-    "init.wind_d": _positive(1.0, "m/s", "1 sigma of the vertical wind."),
     "init.airspeed_scale": _positive(0.1, "1", "Relative 1 sigma of the airspeed's scale."),
     "init.vane": _positive(3.0 * DEG, "rad", "1 sigma of a vane's offset."),
     "rest.gyro": _positive(0.02, "rad/s", "At rest the rate's standard deviation over a second is below this."),
@@ -325,13 +328,14 @@ GROUPS: dict[str, tuple[str, ...]] = {
 
 _TWO_STAGE = tuple(key for key in KEYS if key.startswith("two_stage."))
 #: What only an estimator with wind has.
+_AIR_TAILS = (
+    "wind wind_mean air_walk airspeed aoa sideslip airdata_time no_sideslip drag drag_time given_wind air airdata vanes airspeed_scale vane"
+).split()
 _AIR = tuple(
-    key for key in KEYS
-    if not key.startswith("delay.") and (key.startswith(("air.", "drag.", "wind.")) or key.partition(".")[2] in (
-        "wind", "wind_d", "wind_mean", "air_walk", "airspeed", "aoa", "sideslip", "airdata_time", "no_sideslip", "drag", "drag_time", "given_wind",
-        "air", "airdata", "vanes", "airspeed_scale", "vane",
-    ))
-)  # fmt: skip
+    key
+    for key in KEYS
+    if not key.startswith("delay.") and (key.startswith(("air.", "drag.", "wind.")) or key.partition(".")[2] in _AIR_TAILS)
+)
 _NO_AIR: dict[str, Value] = {"aid.drag": "off", "aid.airdata": "off", "aid.vanes": "off", "aid.no_sideslip": "off", "aid.wind": "off"}
 #: What an estimator sets differently from the defaults above.
 _OVERRIDES: dict[str, dict[str, Value]] = {

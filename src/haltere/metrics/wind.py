@@ -240,9 +240,10 @@ def profile(w: WindSeries) -> Profile | None:
     keep = seconds >= BIN_TIME
     if np.count_nonzero(keep) < 2 or np.ptp(middle[keep]) < RANGE:
         return None
-    parts = (middle, wind, speed, spread, mean(w.speed_sd[use]), seconds)
-    height, wind, speed, spread, sd, seconds = (np.asarray(p[keep], np.float64) for p in parts)
-    return Profile(height, wind, speed, spread, sd, seconds, _law(height, speed, seconds))
+    level = np.exp(mean(np.log(np.maximum(w.height[use], 0.1))))  # of the logarithm, in which the laws are straight
+    parts = (middle, wind, speed, spread, mean(w.speed_sd[use]), seconds, level)
+    height, wind, speed, spread, sd, seconds, level = (np.asarray(p[keep], np.float64) for p in parts)
+    return Profile(height, wind, speed, spread, sd, seconds, _law(level, speed, seconds))
 
 
 def _law(height: FloatArray, speed: FloatArray, seconds: FloatArray) -> dict[str, Any] | None:

@@ -40,6 +40,8 @@ AIR = {"drag": "drag", "airdata": "air data", "wind": "a given wind"}
 GOOD, USABLE, UNLEARNED = 0.5, 1.0, 0.7
 #: Turn of the heading [rad] and change of the velocity [m/s], 5th to 95th percentile, from which a flight counts as excited.
 TURNED, SPED = math.radians(45.0), 2.0
+#: An estimate that moved by so many times what it learned is not to be believed.
+ASTRAY = 4.0
 #: Mean normalised innovation squared above which what is stated is too sure, and far too sure.
 SURE, FAR_TOO_SURE = 1.5, 3.0
 #: Coefficients that the wind hangs on and their names in words.
@@ -90,8 +92,8 @@ def quality(solution: Solution, flight: FlightLog, w: WindSeries) -> Quality:
         judge.say("nothing that feels the air was let in: the wind is what it was assumed to be", 3)
         return judge.quality
     _stated(judge, w)
-    _moved(judge, solution, w, sensors)
-    _learned(judge, solution, w)
+    learned = _learned(judge, solution, w)
+    _moved(judge, solution, w, sensors, learned)
     _innovations(judge, solution, sensors)
     if "wind" in sensors:
         judge.say("a wind given from outside was let in, so this is not independent of it")
@@ -113,8 +115,8 @@ def _stated(judge: _Judge, w: WindSeries) -> None:
         judge.say("the wind was weaker than its uncertainty all the time, so it has no direction")
 
 
-def _moved(judge: _Judge, solution: Solution, w: WindSeries, sensors: list[str]) -> None:
-    """Whether the flight told apart what looks the same at one heading and one air speed."""
+def _moved(judge: _Judge, solution: Solution, w: WindSeries, sensors: list[str], learned: bool) -> None:
+    """Whether the flight told apart what looks the same at one heading and one air speed; ``learned`` is that the drag was."""
     yaw = np.unwrap(euler(solution.vector("q", "wxyz"))[:, 2])[w.flying]
     turn = float(np.ptp(np.percentile(yaw, [5.0, 95.0])))
     change = 0.0
@@ -127,18 +129,20 @@ def _moved(judge: _Judge, solution: Solution, w: WindSeries, sensors: list[str])
         else:
             judge.say(f"{moved}: the wind triangle was seen from several sides")
     elif "drag" in sensors:
-        if turn < TURNED and change < SPED:
+        sped = change >= SPED or learned
+        if turn < TURNED and not sped:
             judge.say(f"{moved}: wind, accelerometer offset and drag are not told apart, so its 1σ rests on what was assumed of those", 1)
         elif turn < TURNED:
             judge.say(f"{moved}: drag was told from wind, an accelerometer offset from wind was not", 1)
-        elif change < SPED:
+        elif not sped:
             judge.say(f"{moved}: an accelerometer offset was told from wind, but the size of the wind hangs on the assumed drag", 1)
         else:
             judge.say(f"{moved}: enough to tell wind, drag and accelerometer offsets apart")
 
 
-def _learned(judge: _Judge, solution: Solution, w: WindSeries) -> None:
-    """What became of the uncertainty of the coefficients."""
+def _learned(judge: _Judge, solution: Solution, w: WindSeries) -> bool:
+    """What became of the uncertainty of the coefficients; whether the drag was learned."""
+    drag = False
     last = int(np.flatnonzero(w.flying)[-1])
     for name, word in SCALES.items():
         if name not in solution or f"sd_{name}" not in solution:
@@ -148,10 +152,16 @@ def _learned(judge: _Judge, solution: Solution, w: WindSeries) -> None:
         if not (math.isfinite(before) and math.isfinite(after) and before > 0.0):
             continue
         said = f"the {word} went from ±{100.0 * before:.2g} % to ±{100.0 * after:.2g} %"
-        if after > UNLEARNED * before:
+        # An estimate moves by what it learned: the variances' difference. More is no learning but a drift.
+        shift = abs(math.log(abs(float(solution[name][last] / solution[name][0]))))
+        if shift > ASTRAY * math.sqrt(max(before**2 - after**2, (0.3 * before) ** 2)):
+            judge.say(f"{said} but moved by a factor of {math.exp(shift):.2g}, more than that says: it is not to be believed", 2)
+        elif after > UNLEARNED * before:
             judge.say(f"{said}: not learned in this flight, and the air speed scales with it", 1)
         else:
+            drag |= name == "drag_mu"
             judge.say(f"{said} (1σ)")
+    return drag
 
 
 def _innovations(judge: _Judge, solution: Solution, sensors: list[str]) -> None:
@@ -166,7 +176,7 @@ def _innovations(judge: _Judge, solution: Solution, sensors: list[str]) -> None:
         elif mean > SURE:
             judge.say(f"{said}: the stated 1σ is too small", 1)
         elif mean < 0.25:
-            judge.say(f"{said}: the stated 1σ is rather too large")
+            judge.say(f"{said}: its noise is set larger than this flight shows")
 
 
 def _axes(values: FloatArray) -> dict[str, float]:

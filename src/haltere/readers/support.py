@@ -23,6 +23,8 @@ COAST = 1.0
 EVENTS = ("modes",)
 #: Below this rate [Hz] rotor speeds show a failing motor too late.
 ROTOR_RATE = 50.0
+#: So many turning rotors make a multirotor, whose drag tells of the wind.
+ROTORS = 3
 
 
 @dataclass(frozen=True)
@@ -274,9 +276,29 @@ def _rotors(out: _Judgement) -> None:
         out.advise(f"for fault detection by rotor speeds: {remedy}")
 
 
+def _wind(out: _Judgement) -> None:
+    """What feels the air; most vehicles have nothing that does, which is no lack of the log."""
+    if not out.fixed:
+        return
+    if out.usable("airdata", "airspeed"):
+        vanes = out.usable("airdata", "aoa", "sideslip")
+        out.can.append(f"wind from the airspeed{' and vanes' if vanes else ''}")
+    elif (n := _turning(out.flight.get("rotors"))) >= ROTORS:
+        out.can.append(f"wind from the drag of {n} rotors")
+
+
+def _turning(rotors: Stream | None) -> int:
+    """Rotors that ever turned, by their speeds, or where there are none by their commands."""
+    for stem in ("speed_", "command_"):
+        columns = [rotors[c] for c in rotors.names if c.startswith(stem)] if rotors is not None else []
+        if columns:
+            return sum(bool(np.any(np.nan_to_num(v) != 0.0)) for v in columns)
+    return 0
+
+
 #: What is looked at for each estimator, one line each; a new estimator is a line here.
 ESTIMATORS: dict[str, tuple[Callable[[_Judgement], None], ...]] = {
-    "navigator": (_attitude, _velocity_and_position, _height, _heading_or_course, _rotors),
+    "navigator": (_attitude, _velocity_and_position, _height, _heading_or_course, _wind, _rotors),
     "ahrs": (_level, _heading),
     "two-stage": (_attitude, _velocity_and_position, _heading_or_course),
 }

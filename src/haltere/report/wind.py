@@ -32,7 +32,12 @@ COEFFICIENTS = (
     ("drag_offset_x", "offset x [m/s²]", 1.0), ("drag_offset_y", "offset y [m/s²]", 1.0), ("airspeed_scale", "airspeed [1]", 1.0),
     ("aoa_offset", "attack [deg]", DEG), ("sideslip_offset", "sideslip [deg]", DEG),
 )  # fmt: skip
-SCALED = ("airspeed_scale", "aoa_offset", "sideslip_offset")
+#: What is estimated of air data.
+PARTS = {
+    "airspeed_scale": "the airspeed its scale",
+    "aoa_offset": "the angle of attack its offset",
+    "sideslip_offset": "the sideslip its offset",
+}
 CONVENTION = (
     "Speed of the air over ground. The direction is the one the wind comes from, clockwise from true north, as weather reports give it; "
     "components, here and in every file, are of the velocity of the air: where it blows to."
@@ -119,7 +124,7 @@ def _speed(c: Context, w: WindSeries) -> Figure:
             1, label, "text", t, turns - 360.0 * np.floor((turns - about) / 360.0 + 0.5), symbol="diamond-open", size=8, unit="deg"
         )
     low, high = panels.extent[0]
-    panels.extent[0] = (min(0.0, low) if low < 1.0 else low, high)
+    panels.extent[0] = (0.0 if low < 1.0 else low, high)  # a band may reach below zero, a speed does not
     figure = panels.figure()
     _compass(figure["layout"]["yaxis2"], about)
     figure["reading"] = "The band is 1σ, first order. Where no direction is drawn the wind is weaker than its own uncertainty." + (
@@ -263,8 +268,9 @@ def _coefficients(c: Context, wanted: list[tuple[str, str, float]]) -> Figure:
             panels.line(k, "smoothed", "smoothed", s.t, factor * s[name], unit=unit, resolution=1e-5, width=1.4, slow=True)
     figure = panels.figure()
     figure["title"] = "Estimated together with the wind"
-    if any(name in SCALED for name, *_ in wanted):
-        figure["reading"] = "Of the airspeed its scale, of the angles of attack and sideslip their offsets."
+    parts = [words for name, words in PARTS.items() if any(name == n for n, *_ in wanted)]
+    if parts:
+        figure["reading"] = f"Of {', of '.join(parts)}."
     return figure
 
 

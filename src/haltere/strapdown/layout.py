@@ -249,26 +249,27 @@ PARAMETERS = np.dtype(
     [
         (name, "f8")
         for name in (
-            "noise_gyro noise_gyro_scale noise_accel noise_gyro_bias noise_accel_bias noise_baro_bias "
+            "noise_gyro noise_gyro_scale noise_between noise_accel noise_gyro_bias noise_accel_bias noise_baro_bias "
             "noise_gnss_velocity noise_gnss_position noise_gnss_altitude noise_gnss_velocity_min noise_gnss_position_min "
             "noise_barometer noise_magnetometer noise_field noise_field_time noise_mag_offset "
             "noise_zero_velocity noise_zero_rate noise_fake_position noise_fake_position_rest noise_fake_velocity "
-            "noise_wind noise_wind_d noise_wind_mean noise_air_walk wind_gust wind_turbulence wind_gust_time  noise_airspeed noise_aoa noise_sideslip noise_no_sideslip noise_drag noise_given_wind "
+            "noise_wind_mean noise_air_walk wind_gust wind_turbulence wind_gust_time "
+            "noise_airspeed noise_aoa noise_sideslip noise_no_sideslip noise_drag noise_given_wind "
             "noise_attitude noise_attitude_yaw noise_attitude_time noise_drag_time noise_airdata_time "
-            "gate_gnss gate_barometer gate_magnetometer gate_zero_velocity gate_zero_rate gate_air gate_attitude "
+            "gate_gnss gate_barometer gate_magnetometer gate_zero_velocity gate_zero_rate gate_air gate_drag gate_attitude "
             "delay_gnss_velocity delay_gnss_position delay_barometer delay_magnetometer delay_power "
             "delay_rotors delay_airdata delay_wind delay_attitude "
             "aid_gnss aid_barometer aid_magnetometer aid_zero_velocity aid_zero_rate aid_fake_position aid_fake_velocity aid_yaw_bank "
             "aid_compass_watch aid_motor_field aid_airdata aid_no_sideslip aid_drag aid_wind aid_attitude "
             "air_moves air_density air_airspeed_min "
             "drag_mu drag_mu_sd drag_c drag_c_sd drag_offset_sd "
-            "timeout_gnss timeout_barometer timeout_magnetometer timeout_air timeout_attitude timeout_imu "
+            "timeout_gnss timeout_barometer timeout_magnetometer timeout_air timeout_drag timeout_attitude timeout_imu "
             "arm_gnss_x arm_gnss_y arm_gnss_z "
             "robust_innovation robust_strength robust_dip robust_heading robust_calibration "
             "field_declination field_dip field_strength field_tolerance_strength field_tolerance_dip "
             "init_tilt_rest init_tilt_motion init_yaw_compass init_yaw_unknown init_gyro_bias_rest init_gyro_bias "
             "init_accel_bias init_velocity init_baro_bias init_mag_offset "
-            "init_wind init_wind_d init_airspeed_scale init_vane "
+            "init_wind init_airspeed_scale init_vane "
             "rest_gyro rest_accel rest_gravity "
             "two_stage_tolerance two_stage_k1 two_stage_k2 two_stage_robust two_stage_index two_stage_innovation "
             "two_stage_radial two_stage_memory "
@@ -293,9 +294,9 @@ def layout(baro: int = 0, mag: int = 0, stages: int = 0, wind: int = 0, drag: in
     stages
         1 with a first stage beside the main state (`two-stage`), else 0.
     wind
-        2 with the horizontal wind as states, 3 with all of it, else 0.
+        2 with the horizontal wind as states, and the mean that its gusts return to, 3 with the vertical wind too, else 0.
     drag
-        4 with the drag of a multirotor as states, and the wind that gusts return to, else 0; it needs a wind of 2.
+        4 with the drag of a multirotor as states, else 0; it needs a wind of 2.
     vane
         1 with the scale of the airspeed as a state, 3 with the offsets of both vanes too, else 0.
 
@@ -304,7 +305,7 @@ def layout(baro: int = 0, mag: int = 0, stages: int = 0, wind: int = 0, drag: in
     numpy.dtype
         Nominal state, covariance ``P`` (n, n), scratch, queues, monitors and counters: the whole memory of a filter.
     """
-    n = CORE + baro + mag + wind + (drag + 2 if drag else 0) + vane
+    n = CORE + baro + mag + (wind + 2 if wind else 0) + drag + vane
     return np.dtype(
         [
             ("t", "f8"),
@@ -317,7 +318,7 @@ def layout(baro: int = 0, mag: int = 0, stages: int = 0, wind: int = 0, drag: in
             ("mag", "f8", (mag,)),  # offset of the magnetometer in the body frame [uT]
             ("wind", "f8", (wind,)),  # NED [m/s]; in a layout with drag its force at hover [m/s^2], see `aids.air`
             ("drag", "f8", (drag,)),  # ln mu [1/s], ln c [1/m], offset of the thrust's axis along x and y [m/s^2]
-            ("steady", "f8", (2 if drag else 0,)),  # what the wind returns to after gusts, likewise
+            ("steady", "f8", (2 if wind else 0,)),  # what the wind returns to after gusts, likewise
             ("vane", "f8", (vane,)),  # ln of the airspeed's scale, offsets of angle of attack and sideslip [rad]
             ("P", "f8", (n, n)),
             ("dx", "f8", n),

@@ -9,11 +9,11 @@ import math
 from typing import Any
 
 from haltere._jit import jit
-from haltere.core.rotation import Mat, Vec, cross, dcm, dot, mat_vec, quat_from_rotvec, quat_mul, quat_unit, rotvec_dcm
+from haltere.core.rotation import Mat, Vec, cross, dcm, dot, mat_vec, quat_from_rotvec, quat_mul, quat_unit, rotvec_dcm, sub
 from haltere.filter.update import symmetrise
 from haltere.strapdown.optional import add_optional
 
-__all__ = ["gust_keeps", "inject", "left_F", "mechanise", "predict", "propagate", "transition", "turn"]
+__all__ = ["gust_keeps", "inject", "left_F", "mechanise", "predict", "propagate", "transition", "turn", "unseen"]
 
 
 @jit
@@ -198,6 +198,22 @@ def propagate(s: Any, prm: Any, C: Mat, D: Mat, A: Mat, B: Mat, dt: float) -> No
 
 
 @jit
+def unseen(s: Any, prm: Any, w0: Vec, f0: Vec, w1: Vec, f1: Vec, dt: float) -> None:
+    """Admit that the course between two samples is not known: 1 sigma of its mean is ``noise.between`` of the change from one to the other.
+
+    At 250 Hz that is next to nothing, at 25 Hz, as logs have it, more than the noise.
+    """
+    k = prm.noise_between * dt
+    k2 = k * k
+    f = sub(f1, f0)
+    force = k2 * dot(f, f) / 3.0  # in whatever direction
+    for i in range(3):
+        w = w1[i] - w0[i]
+        s.P[i, i] += k2 * w * w
+        s.P[3 + i, 3 + i] += force
+
+
+@jit
 def gust_keeps(prm: Any, dt: float) -> float:
     """What is left of a gust after ``dt`` seconds."""
     return math.exp(-dt / prm.wind_gust_time)
@@ -207,33 +223,42 @@ def gust_keeps(prm: Any, dt: float) -> float:
 def blow(s: Any, prm: Any, o: int, dt: float) -> None:
     """Advance wind and coefficients of the air, from error state ``o`` on.
 
-    A wind W of its own walks. One that drag shows is gusts about a slow mean, dA = -(A - Ā) dt/τ + noise, both as the specific force on a
-    vehicle at hover, A = µW + c|W|W (see `haltere.aids.air`), the noise of W times µ + 2c|W|: for a wind that only walked, drag that follows the vehicle's motion would look like wind that returns, and µ would be found wrong
-    (theory-amendments.md §2).
+    Wind is gusts about a slow mean, dW = -(W - W̄) dt/τ + noise; the mean of the vertical wind is zero. In a layout with drag the state is
+    the specific force on a vehicle at hover, A = µW + c|W|W (see `haltere.aids.air`), and the noise is that of W times µ + 2c|W|. A wind
+    that only walked would let drag that follows the vehicle's motion look like wind that returns, and µ would be found wrong
+    (theory-amendments.md §2); without GNSS it would run away with the velocity.
     """
     P, n = s.P, s.P.shape[0]
-    if len(s.drag) == 0:
-        for i in range(len(s.wind)):
-            walk = prm.noise_wind if i < 2 else prm.noise_wind_d
-            P[o + i, o + i] += walk * walk * dt
-    first = o + len(s.wind)
+    first, keep = o + len(s.wind), gust_keeps(prm, dt)
+    m = first + len(s.drag)
+    speed, factor = math.sqrt(s.steady[0] * s.steady[0] + s.steady[1] * s.steady[1]), 1.0
     if len(s.drag) > 0:
-        m, mu, keep = first + len(s.drag), math.exp(s.drag[0]), gust_keeps(prm, dt)
-        for i in range(2):
+        mu, c = math.exp(s.drag[0]), math.exp(s.drag[1])
+        factor = math.sqrt(mu * mu + 4.0 * c * speed)  # µ + 2c|W|
+        speed = 2.0 * speed / (mu + factor)
+    gust, walk = factor * (prm.wind_gust + prm.wind_turbulence * speed), factor * prm.noise_wind_mean
+    for i in range(len(s.wind)):
+        if i < 2:
             s.wind[i] = keep * s.wind[i] + (1.0 - keep) * s.steady[i]
             for j in range(n):
                 P[o + i, j] = keep * P[o + i, j] + (1.0 - keep) * P[m + i, j]
-        for j in range(n):
-            for i in range(2):
+        else:
+            s.wind[i] *= keep
+            for j in range(n):
+                P[o + i, j] *= keep
+    for j in range(n):
+        for i in range(len(s.wind)):
+            if i < 2:
                 P[j, o + i] = keep * P[j, o + i] + (1.0 - keep) * P[j, m + i]
-        root = math.sqrt(mu * mu + 4.0 * math.exp(s.drag[1]) * math.sqrt(s.steady[0] * s.steady[0] + s.steady[1] * s.steady[1]))
-        speed = (root - mu) / (2.0 * math.exp(s.drag[1]))  # of the mean wind; root is what a change of wind is multiplied with there
-        gust, walk = root * (prm.wind_gust + prm.wind_turbulence * speed), root * prm.noise_wind_mean
-        for i in range(2):
-            P[o + i, o + i] += gust * gust * (1.0 - keep * keep)
-            P[m + i, m + i] += walk * walk * dt
+            else:
+                P[j, o + i] *= keep
+    for i in range(len(s.wind)):
+        k = gust if i < 2 else 0.5 * gust
+        P[o + i, o + i] += k * k * (1.0 - keep * keep)
+    for i in range(2):
+        P[m + i, m + i] += walk * walk * dt
     for i in range(first, n):
-        if i < first + len(s.drag) or i >= first + len(s.drag) + len(s.steady):
+        if i < m or i >= m + 2:
             P[i, i] += prm.noise_air_walk * prm.noise_air_walk * dt
 
 
