@@ -263,6 +263,19 @@ def test_a_damaged_table_is_one_clear_error(identified: VehicleIdentification, c
         lumped_of(load_vehicle("iris"))
 
 
+def test_lost_and_repeated_rows_of_rotors(excited: FlightLog, identified: VehicleIdentification) -> None:
+    rng = np.random.default_rng(4)
+    rotors = excited["rotors"]
+    columns = {k: v.copy() for k, v in rotors.columns.items()}
+    lost = rng.random(len(rotors)) < 0.1
+    columns["speed_2"][lost] = np.nan
+    held = np.flatnonzero(~lost)[1::7]
+    for k in range(4):
+        columns[f"speed_{k}"][held] = columns[f"speed_{k}"][held - 1]
+    d = identify_vehicle(FlightLog({**excited.streams, "rotors": columns}, excited.meta), vehicle="iris", set=TEMPERATURE)
+    assert d.lumped.k[3:, 0] == pytest.approx(identified.lumped.k[3:, 0], rel=0.05)
+
+
 def without_speeds(flight: FlightLog) -> FlightLog:
     rotors = {k: v for k, v in flight["rotors"].columns.items() if not k.startswith("speed_")}
     return FlightLog({**flight.streams, "rotors": rotors}, flight.meta)
