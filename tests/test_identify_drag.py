@@ -257,6 +257,17 @@ def test_density_from_pressure_and_temperature(toured: FlightLog) -> None:
     assert motion(nothing).density.mean() == pytest.approx(1.155, rel=0.02)  # from GNSS altitude
 
 
+def test_a_flight_without_gnss_is_refused_and_what_is_not_known_left_out(toured: FlightLog) -> None:
+    with pytest.raises(haltere.HaltereError, match="GNSS velocity or position"):
+        identify_drag(toured.without("gnss"), set=TEMPERATURE)
+    gnss = toured["gnss"]
+    lost = FlightLog({**toured.streams, "gnss": gnss.where(gnss.t < 40.0)}, toured.meta)
+    m = motion(lost, set=TEMPERATURE)
+    assert m.air[(m.t > 20.0) & (m.t < 39.0)].all()
+    assert not m.air[(m.t > 65.0) & (m.t < 75.0)].any()  # nothing comes after that a smoother could hold on to
+    assert any("left out" in n for n in m.notes)
+
+
 def test_on_the_ground_is_not_in_the_air(toured: FlightLog) -> None:
     m = motion(toured)
     truth = toured["truth"]

@@ -26,6 +26,8 @@ BoolArray = NDArray[np.bool_]
 
 #: Length of the windows over which drag is looked at [s], and the least time in the air that anything is fitted to [s].
 WINDOW, LEAST = 0.1, 10.0
+#: Fewest components of GNSS fused, and 1 sigma of the velocity up to which it is taken for known [m/s].
+LEAST_FIXES, KNOWN = 60, 0.4
 #: The navigator must not know of drag what is to be found.
 APART = {"aid.drag": "off", "aid.wind": "off"}
 #: Longest interval of rotor telemetry that tells the speed between samples [s].
@@ -127,7 +129,13 @@ def motion(
     vel, pos = s.vector("vel", "ned"), s.vector("pos", "ned")
     notes: list[str] = []
     density, sd = air_density(used, solution.config, t, -pos[:, 2], notes)
-    air = _in_air(solution, t, vel, pos)
+    fixes = int(np.sum((solution.aids["sensor"] == "gnss") & (solution.aids["status"] == "fused")))
+    if fixes < LEAST_FIXES:
+        raise HaltereError("GNSS velocity or position through the flight", f"{fixes} components fused", name, "motion is not known without")
+    known = np.max(s.vector("sd_vel", "ned"), axis=1) < KNOWN
+    if float(np.mean(known)) < 0.99:
+        notes.append(f"{100.0 * float(np.mean(~known)):.0f} % of the flight left out, where velocity is known to {KNOWN:g} m/s or worse")
+    air = _in_air(solution, t, vel, pos) & known
     seconds = float(np.sum(np.diff(t)[air[1:]])) if len(t) > 1 else 0.0
     if seconds < least:
         raise HaltereError(f"at least {least:g} s in the air", f"{seconds:.1f} s", name, "identify from a log that holds a flight")
