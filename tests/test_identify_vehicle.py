@@ -167,6 +167,12 @@ def test_predicts_a_flight_it_has_not_seen(identified: VehicleIdentification) ->
     assert (check.error < 2.0 * np.maximum(identified.lumped.residual_sd, 0.05)).all()
 
 
+def test_each_flight_is_predicted_from_the_others(excited: FlightLog) -> None:
+    d = identify_vehicle([excited, flown("lissajous", seed=8, delay=0.013)], vehicle="iris", set=TEMPERATURE)
+    assert [c.seen for c in d.checks] == [True, True, False, False]
+    assert (d.checks[3].explained[:3] > 0.95).all()  # lissajous from identify
+
+
 def test_lag_is_found(identified: VehicleIdentification) -> None:
     assert identified.tracks[0].speeds.lag == pytest.approx(0.013, abs=0.002)
 

@@ -45,7 +45,10 @@ def drag_page(d: DragIdentification, command: str | None = None) -> str:
         The text of ``drag.html``.
     """
     pool = Pool()
-    sections = [_curve(d), *(_flight(d, k, pool) for k in range(len(d.flights))), _winds(d), _models(d), _paste(d), _done(d, command)]
+    flights = [_flight(d, k, pool) for k in range(len(d.flights))]
+    # of a refused fit the measured forces are shown and what the models came to, but no drag and no wind
+    sections = [*flights, _models(d)] if d.refused else [_curve(d), *flights, _winds(d), _models(d)]
+    sections += [_paste(d), _done(d, command)]
     figures: list[Figure] = []
     body = [_header(d), *(section_html(s, figures) for s in sections)]
     return document(f"{d.name}, drag", body, [(s.key, s.title) for s in sections], figures, pool, span=_span(d, 0), footer=FOOTER)
@@ -118,23 +121,29 @@ def _curve(d: DragIdentification) -> Section:
 def _flight(d: DragIdentification, k: int, pool: Pool) -> Section:
     """Force measured and predicted, and the wind, over time."""
     s, part = d.flights[k], d.base.parts[k]
-    panels = Panels(f"flight{k}", pool, _span(d, k), ["force x [m/s²]", "force y [m/s²]", "wind north [m/s]", "wind east [m/s]"], 140)
+    titles = ["force x [m/s²]", "force y [m/s²]"] + ([] if d.refused else ["wind north [m/s]", "wind east [m/s]"])
+    panels = Panels(f"flight{k}", pool, _span(d, k), titles, 140)
     load = load_of(d.base.form, s)
     predicted = drag_force(d.base.form, d.base.values, _air(d, k, True), load, s.density) + part.rest[:2]
     steady = drag_force(d.base.form, d.base.values, _air(d, k, False), load, s.density) + part.rest[:2]
     for a in range(2):
         panels.line(a, "measured", "imu", s.t, s.force_b[:, a], unit="m/s²", resolution=1e-3, width=1.0)
+        if d.refused:
+            continue
         panels.line(a, "predicted, mean wind", "assumed", s.t, steady[:, a], unit="m/s²", resolution=1e-3, width=1.0)
         panels.line(a, "predicted", "estimate", s.t, predicted[:, a], unit="m/s²", resolution=1e-3, width=1.2)
         panels.line(2 + a, "wind", "estimate", s.t, part.wind_path[:, a], unit="m/s", resolution=1e-3, width=1.2)
         panels.line(2 + a, "mean wind", "limit", np.array(_span(d, k)), np.full(2, part.wind[a]), unit="m/s", width=1.0)
+    name = d.motions[k].name if len(d.flights) > 1 else "Flight"
+    if d.refused:
+        return Section(f"flight{k}", name, "Force across the thrust axis, means of 0.1 s in the air.", [panels.figure()])
     noise = float(np.sqrt(np.mean((s.force_b[:, :2] - predicted) ** 2)))
     plain = float(np.sqrt(np.mean((s.force_b[:, :2] - steady) ** 2)))
     note = (
         f"Means of 0.1 s in the air. What is left: {noise:.2g} m/s² (rms) with the most likely gusts, {plain:.2g} m/s² with the mean wind "
         "alone. The prediction with gusts has seen the measurement."
     )
-    return Section(f"flight{k}", d.motions[k].name if len(d.flights) > 1 else "Flight", note, [panels.figure()])
+    return Section(f"flight{k}", name, note, [panels.figure()])
 
 
 def _winds(d: DragIdentification) -> Section:
