@@ -27,8 +27,9 @@ FloatArray = NDArray[np.float64]
 REFUSED, POOR = 0.35, 0.12
 #: A quadratic coefficient less than this many sigma above zero is left away.
 TOLD = 2.0
-#: Without rotor speeds, where their root of thrust is bent by inflow, errors in simulation were this many times 1 sigma.
-DOUBT = 1.5
+#: Without rotor speeds, where their root of thrust is bent by inflow, errors in simulation were about this many times 1 sigma; and more of
+#: ArduPilot's formula, whose quadratic part knows each axis by itself.
+DOUBT, DOUBT_AXES = 1.5, 2.0
 #: Least spread of the ground velocity [m/s, root mean square], largest offset [m/s^2] and least quadratic drag [sigma] that are believed.
 LEAST_SPREAD, LARGEST_OFFSET, LEAST_C = 0.7, 1.0, -3.0
 #: Mean wind known worse than this is said to be mixed with offsets [m/s].
@@ -83,12 +84,13 @@ class DragIdentification:
     def sd(self, p: Projection) -> FloatArray:
         """1 sigma of parameters with that of the air density: the linear one goes with its root, the quadratic with itself."""
         share = np.r_[0.5, np.ones(len(p.values) - 1)] * self.density_sd
-        return np.asarray(np.hypot(self.doubt * p.sd, share * np.abs(p.values)))
+        return np.asarray(np.hypot(self.doubt(p.form) * p.sd, share * np.abs(p.values)))
 
-    @property
-    def doubt(self) -> float:
-        """Factor on 1 sigma for what the model of the drag itself is wrong by."""
-        return 1.0 if self.base.form == "rotors" else DOUBT
+    def doubt(self, form: str) -> float:
+        """Factor on 1 sigma of a form's parameters for what the model of the drag itself is wrong by."""
+        if self.base.form == "rotors":
+            return 1.0
+        return DOUBT_AXES if form == "ardupilot" else DOUBT
 
     @property
     def own(self) -> tuple[FloatArray, FloatArray]:
@@ -110,7 +112,7 @@ class DragIdentification:
         s = self.flights[0]
         load = float(np.mean(np.concatenate([load_of(form, f) for f in self.flights])))
         g = np.array([5.0 * math.sqrt(self.density / 1.225 * max(load, 0.0) / 9.80665), 25.0 * float(np.mean(s.density)) / 1.225])
-        return float(g @ self.haltere.values), self.doubt * float(np.sqrt(max(g @ self.haltere.covariance @ g, 0.0)))
+        return float(g @ self.haltere.values), self.doubt(form) * float(np.sqrt(max(g @ self.haltere.covariance @ g, 0.0)))
 
 
 class NotObservableError(HaltereError):
@@ -170,7 +172,7 @@ def identify_drag(
     else:
         notes.append(
             "no rotor speeds through the flight: drag is taken to go with the root of the thrust, which inflow and translational lift "
-            f"bend; 1 sigma of what is to be pasted is raised by {DOUBT:g}"
+            f"bend; 1 sigma of what is to be pasted is raised by {DOUBT:g}, of ArduPilot's by {DOUBT_AXES:g}"
         )
     fits = {form: fit(form, windows) for form in forms}
     base = min((fits[f] for f in ("rotors", "haltere") if f in fits), key=lambda r: r.bic)
