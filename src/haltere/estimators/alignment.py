@@ -48,7 +48,7 @@ from haltere.core.rotation import (
 from haltere.estimators import yaw_bank
 from haltere.filter.queue import pop_due
 
-__all__ = ["AT_REST", "GIVEN", "GRAVITY_ONLY", "IN_MOTION", "begin", "gather", "level_and_compass"]
+__all__ = ["AT_REST", "GIVEN", "GRAVITY_ONLY", "IN_MOTION", "begin", "gather", "level_and_compass", "start_air"]
 
 AT_REST, IN_MOTION, GRAVITY_ONLY, TWO_SPANS, GIVEN = (constant(i) for i in (1, 2, 3, 4, 5))
 #: Longest wait [s] for a compass at rest, and for GNSS or rest before gravity alone must do.

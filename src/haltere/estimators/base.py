@@ -115,7 +115,7 @@ class InitialState:
     q_nb, vel_n, pos_n, gyro_bias_b, accel_bias_b
         Nominal state, SI units.
     P
-        Covariance (n, n) in the order of `State.P`.
+        Covariance (n, n) in the order of `State.P`, or of it without wind and coefficients of the air, which then begin as configured.
     baro_bias
         Barometer offset [m].
     """
@@ -147,7 +147,7 @@ def new_state(config: Config, initial: InitialState | None = None) -> NDArray[np
         record["field"][0, 1:] = dip, strength
         record["has_field"] = 1
     if initial is not None:
-        _begin_from(record, initial)
+        _begin_from(record, config, initial)
     return record
 
 
@@ -165,10 +165,12 @@ def _sizes(config: Config) -> dict[str, int]:
     }
 
 
-def _begin_from(record: NDArray[np.void], initial: InitialState) -> None:
+def _begin_from(record: NDArray[np.void], config: Config, initial: InitialState) -> None:
     n = record["P"].shape[1]
     P = np.asarray(initial.P, dtype=np.float64)
-    if P.shape != (n, n):
+    sizes = _sizes(config)
+    told = CORE + sizes["baro"] + sizes["mag"]  # without the states of the air: these begin as configured
+    if P.shape not in ((n, n), (told, told)):
         raise HaltereError(f"an initial covariance of shape ({n}, {n})", f"{P.shape}", "initial state", "see State.P for the order")
     if not np.allclose(P, P.T, rtol=1e-9, atol=1e-15) or np.linalg.eigvalsh(P).min() <= 0.0:
         raise HaltereError("a symmetric positive covariance", "one that is not", "initial state")
@@ -182,7 +184,8 @@ def _begin_from(record: NDArray[np.void], initial: InitialState) -> None:
     if n > CORE:
         record["baro"][0, 0] = initial.baro_bias
     record["q"][0] /= np.linalg.norm(record["q"][0])
-    record["P"][0] = P
+    kernels.begin_air(record, parameters(config))
+    record["P"][0, : len(P), : len(P)] = P
     for field in ("q", "v", "p", "bg", "ba"):
         record["a"][field][0] = record[field][0]
     record["a"]["P"][0] = P[:CORE, :CORE]
@@ -371,7 +374,10 @@ class Estimator:
 
     def _offer_of_the_air(self, sensor: str, t: float, values: Sequence[float] | Mapping[str, float]) -> bool:
         if sensor == "rotors":
-            speeds = values.values() if isinstance(values, Mapping) else _flat(values, "values of rotors")
+            named = [v for k, v in values.items() if str(k).startswith("speed_")] if isinstance(values, Mapping) else None
+            if named == []:
+                raise UsageError("values of rotors by name (speed_0, speed_1, ...)", ", ".join(map(repr, values)), "Estimator.offer")
+            speeds = named or _flat(values, "values of rotors")
             total = sum(abs(_number(x, "a rotor's speed", "Estimator.offer")) for x in speeds)
             return self._queue(ROTORS, t, (total, math.nan, math.nan), _NAN) if math.isfinite(total) else self._refuse(sensor, "not finite")
         v = _in_order(sensor, values, {"airdata": 1, "wind": 2, "attitude": 4}[sensor])

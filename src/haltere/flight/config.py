@@ -118,7 +118,7 @@ KEYS: dict[str, Key] = {
     ),
     "noise.wind_mean": _positive(0.05, "m/s/sqrt(s)", "Walk of the mean wind, which gusts return to."),
     "wind.gust": _positive(0.3, "m/s", "Gusts, 1 sigma an axis in calm air; vertical ones are half of it."),
-    "wind.turbulence": Key(0.2, "1", "Gusts more in proportion to the mean wind.", low=0.0, high=2.0),
+    "wind.turbulence": Key(0.15, "1", "Gusts more in proportion to the mean wind.", low=0.0, high=2.0),
     "wind.gust_time": _positive(3.0, "s", "How long a gust lasts."),
     "noise.air_walk": _positive(
         2e-3, "1/sqrt(s)", "Walk of what air data depend on: relative for drag and airspeed scale, in m/s^2 and rad for offsets."
@@ -128,7 +128,7 @@ KEYS: dict[str, Key] = {
     "noise.sideslip": _positive(2.0 * DEG, "rad", "Vane of the sideslip, 1 sigma, likewise."),
     "noise.airdata_time": Key(0.5, "s", "How long errors of air data last (gusts shorter than that, the tube's lag).", low=0.0),
     "noise.no_sideslip": _positive(6.0 * DEG, "rad", "Sideslip of an aeroplane without vanes, 1 sigma, likewise."),
-    "noise.drag": _positive(0.2, "m/s^2", "What the drag model misses, 1 sigma, alike in all samples of noise.drag_time."),
+    "noise.drag": _positive(0.15, "m/s^2", "What the drag model misses, 1 sigma, alike in all samples of noise.drag_time."),
     "noise.drag_time": Key(0.2, "s", "That correlation time.", low=0.0),
     "noise.given_wind": _positive(1.0, "m/s", "Wind told from outside, 1 sigma, where no sd is told with it."),
     "noise.attitude": _positive(1.0 * DEG, "rad", "Roll and pitch told from outside, 1 sigma."),
