@@ -105,7 +105,7 @@ def drag_force(form: str, p: FloatArray, v: FloatArray, load: FloatArray, rho: F
         slopes = (np.outer(load, p[[0, 3]]) + p[[1, 4]] + np.outer(speed, p[[2, 5]])) * (rho / RHO0)[:, None]
         return np.asarray(-slopes * across)
     if form == "px4":
-        level = np.maximum(across[:, 0] ** 2 + across[:, 1] ** 2, 1e-12)
+        level = np.maximum(across[:, 0] ** 2 + across[:, 1] ** 2, 1e-300)
         # PX4 takes the root of the mean square of the two; the mean is smooth through zero, and 5 % less where one is twice the other
         b = (p[1] * across[:, 0] ** 2 + p[2] * across[:, 1] ** 2) / level
         return np.asarray(-(p[0] * np.sqrt(rho / RHO0) + 0.5 * rho * b * speed)[:, None] * across)
