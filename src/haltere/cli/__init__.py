@@ -60,12 +60,16 @@ def _common(
 def _run(
     log: Log,
     estimator: Annotated[
-        str | None, typer.Option("--estimator", metavar="E", help="navigator (default), ahrs or two-stage.", show_default=False)
+        str | None,
+        typer.Option("--estimator", metavar="E", help="navigator (default), ahrs, two-stage or wind-attitude.", show_default=False),
     ] = None,
     preset: Annotated[
         str | None,
         typer.Option(
-            "--preset", metavar="P", help="Named set of parameters; two-stage has as-corrected and as-printed.", show_default=False
+            "--preset",
+            metavar="P",
+            help="Named set of parameters; two-stage and wind-attitude have as-corrected and as-printed.",
+            show_default=False,
         ),
     ] = None,
     config: Annotated[

@@ -24,6 +24,7 @@ PRESETS: dict[str, tuple[str, ...]] = {
     "navigator": ("default",),
     "ahrs": ("default",),
     "two-stage": ("default", "as-corrected", "as-printed"),
+    "wind-attitude": ("default", "as-corrected", "as-printed"),
 }
 ESTIMATORS = tuple(PRESETS)
 
@@ -116,6 +117,12 @@ KEYS: dict[str, Key] = {
         "m/s",
         "Fake velocity of ahrs, 1 sigma at 5 Hz: worth 2 m/s that last a second. Lower trusts gravity more, accelerations less.",
     ),
+    "wind.n": Key(math.nan, "m/s", "Wind taken for true, where it blows to, north. Default: not given.", low=-100.0, high=100.0),
+    "wind.e": Key(math.nan, "m/s", "The same, east.", low=-100.0, high=100.0),
+    "wind.d": Key(0.0, "m/s", "The same, down.", low=-50.0, high=50.0),
+    "wind.speed": Key(math.nan, "m/s", "Instead of wind.n and wind.e, as a station gives it: its speed,", low=0.0, high=100.0),
+    "wind.from": Key(math.nan, "rad", "and where it comes from, clockwise from true north.", low=-6.2832, high=6.2832),
+    "wind.sd": _positive(1.0, "m/s", "1 sigma of each of its components, gusts included."),
     "noise.wind_mean": _positive(0.05, "m/s/sqrt(s)", "Walk of the mean wind, which gusts return to."),
     "wind.gust": _positive(0.3, "m/s", "Gusts, 1 sigma an axis in calm air; vertical ones are half of it."),
     "wind.turbulence": Key(0.15, "1", "Gusts more in proportion to the mean wind.", low=0.0, high=2.0),
@@ -284,6 +291,35 @@ KEYS: dict[str, Key] = {
     "two_stage.height_sign": _switch(
         "minus", "Down position of a fix is minus the height above the origin; plus is a misprint of the source.", ("minus", "plus")
     ),
+    "wind_attitude.filter": _switch(
+        "error-state",
+        "The filter behind wind-attitude, as its preset says: the error-state filter of haltere with wind as a state, or the published one "
+        "of four states.",
+        ("error-state", "quaternion"),
+    ),
+    "wind_attitude.integrator": _switch(
+        "picard4",
+        "Step of the quaternion: Picard's approximations (published: the fourth), Runge-Kutta, or exact for a constant rate.",
+        ("picard1", "picard2", "picard3", "picard4", "rk4", "exp"),
+    ),
+    "wind_attitude.residual": _switch("nonlinear", "z - h(q), or Z - H X as (25) prints it.", ("nonlinear", "printed")),
+    "wind_attitude.rows": _switch("jacobian", "Rows 7 to 9 of H: of the wind triangle, or as (20) prints them.", ("jacobian", "printed")),
+    "wind_attitude.normalise": _switch(
+        "on", "Bring the quaternion back to length one after each step: its covariance too (on), or not (length).", ("off", "length", "on")
+    ),
+    "wind_attitude.angles": _switch(
+        "atan2", "Roll and yaw given out: over the whole circle, or by the arc tangents of (3).", ("atan2", "arctan")
+    ),
+    "wind_attitude.accel": _switch("on", "Take specific force for gravity."),
+    "wind_attitude.force": _positive(1.0, "m/s^2", "Only where its size differs from gravity by less than this."),
+    "wind_attitude.acceleration": _positive(1.5, "m/s^2", "And only where GNSS velocity, if any, shows an acceleration below this."),
+    "wind_attitude.gate": _positive(1e6, "sigma", "Innovation gate of gravity, joint over the components."),
+    "wind_attitude.air": _switch(
+        "auto",
+        "Where the velocity through the air is from: vanes (stream airdata), drag (specific force over drag.*), or what there is: vanes, "
+        "else drag where at least three rotors turn.",
+        ("off", "vanes", "drag", "auto"),
+    ),
     "imu.kind": _switch("instant", "An IMU sample is the value at its time, or the mean since the sample before.", ("instant", "mean")),
     "baro.temperature": Key(
         math.nan, "K", "Air temperature at the ground, scales pressure altitude. Default: standard atmosphere.", low=200.0, high=330.0
@@ -327,6 +363,9 @@ GROUPS: dict[str, tuple[str, ...]] = {
 }
 
 _TWO_STAGE = tuple(key for key in KEYS if key.startswith("two_stage."))
+_WIND_ATTITUDE = tuple(key for key in KEYS if key.startswith("wind_attitude."))
+#: A wind taken for true, which only the published filter of wind-attitude needs.
+_GIVEN_WIND = tuple(f"wind.{key}" for key in ("n", "e", "d", "speed", "from", "sd"))
 #: What only an estimator with wind has.
 _AIR_TAILS = (
     "wind wind_mean air_walk airspeed aoa sideslip airdata_time no_sideslip drag drag_time given_wind air airdata vanes airspeed_scale vane"
@@ -350,6 +389,7 @@ _OVERRIDES: dict[str, dict[str, Value]] = {
         "aid.motor_field": "off", "two_stage.radial": 0.05, "two_stage.memory": 10.0,
         **_NO_AIR,
     },
+    "wind-attitude": {"air.moves": "all", "aid.magnetometer": "3-axis"},
 }  # fmt: skip
 _NO_GATE = 1e6
 #: What a preset of an estimator sets differently from its `default`. The source has no innovation tests.
@@ -364,11 +404,27 @@ _PRESET_OVERRIDES["two-stage", "as-printed"] = _PRESET_OVERRIDES["two-stage", "a
     "two_stage.index": "algebraic",
     "two_stage.height_sign": "plus",
 }
+_PRESET_OVERRIDES["wind-attitude", "as-corrected"] = {
+    "wind_attitude.filter": "quaternion", "aid.magnetometer": "3-axis", "gate.magnetometer": _NO_GATE, "gate.air": _NO_GATE,
+    "noise.field": 0.0, "aid.airdata": "on",
+}  # fmt: skip
+_PRESET_OVERRIDES["wind-attitude", "as-printed"] = _PRESET_OVERRIDES["wind-attitude", "as-corrected"] | {
+    "wind_attitude.residual": "printed", "wind_attitude.rows": "printed", "wind_attitude.normalise": "off",
+    "wind_attitude.angles": "arctan", "wind_attitude.force": _NO_GATE, "wind_attitude.acceleration": _NO_GATE,
+}  # fmt: skip
+#: Where the keys begin that the published filter of wind-attitude is told; noise and delays a flight may tell of any sensor.
+_QUATERNION = (
+    "noise.", "delay.", "gate.magnetometer", "gate.air", "aid.gnss", "aid.magnetometer", "aid.airdata", "aid.wind", "timeout.magnetometer",
+    "timeout.imu", "field.", "home.", "init.tilt_", "init.yaw_", "init.accel_bias", "rest.gyro", "rest.gravity", "imu.kind", "unit.",
+    "axes.", "magnetometer.offset_", "magnetometer.matrix_", "magnetometer.load", "air.density", "drag.", "wind_attitude.", *_GIVEN_WIND,
+)  # fmt: skip
 #: Keys that an estimator does not have: changing them would change nothing, or make it another one.
 _FIXED: dict[str, tuple[str, ...]] = {
-    "navigator": _TWO_STAGE,
-    "ahrs": (*_OVERRIDES["ahrs"], *_TWO_STAGE, *_AIR),
+    "navigator": (*_TWO_STAGE, *_WIND_ATTITUDE, *_GIVEN_WIND),
+    "ahrs": (*_OVERRIDES["ahrs"], *_TWO_STAGE, *_AIR, *_WIND_ATTITUDE),
+    "wind-attitude": (*_TWO_STAGE, "wind_attitude.filter"),
     "two-stage": (
+        *_WIND_ATTITUDE,
         *_AIR,
         "aid.barometer",
         "baro.offset",
@@ -387,11 +443,21 @@ _FIXED: dict[str, tuple[str, ...]] = {
         "robust.calibration",
     ),
 }
+#: Further ones by preset.
+_FIXED_PRESET: dict[tuple[str, str], tuple[str, ...]] = {
+    ("wind-attitude", "default"): (*_WIND_ATTITUDE, *_GIVEN_WIND),
+    **{("wind-attitude", preset): tuple(k for k in KEYS if not k.startswith(_QUATERNION)) for preset in ("as-corrected", "as-printed")},
+}
 #: Words of a switch that an estimator does not have.
 _LACKS: dict[str, dict[str, tuple[str, ...]]] = {
     "navigator": {"aid.magnetometer": ("orthonormal",)},
     "ahrs": {"aid.magnetometer": ("orthonormal",)},
     "two-stage": {"aid.magnetometer": ("heading", "3-axis")},
+    "wind-attitude": {"aid.magnetometer": ("orthonormal",)},
+}
+_LACKS_PRESET: dict[tuple[str, str], dict[str, tuple[str, ...]]] = {
+    ("wind-attitude", preset): {"aid.magnetometer": ("heading", "orthonormal"), "aid.airdata": ("auto",)}
+    for preset in ("as-corrected", "as-printed")
 }
 
 
@@ -482,14 +548,16 @@ def resolve(estimator: str = "navigator", preset: str = "default", overrides: Ma
         Unknown estimator, preset or key (with the nearest name), a value out of bounds, or a key the estimator lacks.
     """
     values = defaults(estimator, preset)
+    fixed = (*_FIXED[estimator], *_FIXED_PRESET.get((estimator, preset), ()))
+    lacks = _LACKS[estimator] | _LACKS_PRESET.get((estimator, preset), {})
     for key, value in (overrides or {}).items():
         for name in GROUPS.get(key, (key,)):
             checked = _check(name, value, where)
             same = checked == values[name] or (checked != checked and values[name] != values[name])
-            if name in _FIXED[estimator] and not same:
+            if name in fixed and not same:
                 raise UsageError(f"a key that {estimator} has", repr(name), where, f"{estimator} keeps it at {values[name]}")
-            if checked in _LACKS[estimator].get(name, ()):
-                left = [w for w in KEYS[name].words if w not in _LACKS[estimator][name]]
+            if checked in lacks.get(name, ()):
+                left = [w for w in KEYS[name].words if w not in lacks[name]]
                 raise UsageError(f"{name} of {estimator} to be {' or '.join(left)}", repr(checked), where)
             values[name] = checked
     if estimator == "two-stage" and not float(values["two_stage.k1"]) < float(values["two_stage.k2"]):

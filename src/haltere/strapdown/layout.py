@@ -274,6 +274,8 @@ PARAMETERS = np.dtype(
             "two_stage_tolerance two_stage_k1 two_stage_k2 two_stage_robust two_stage_index two_stage_innovation "
             "two_stage_radial two_stage_memory "
             "two_stage_haversine two_stage_height_sign "
+            "wind_attitude_integrator wind_attitude_residual wind_attitude_rows wind_attitude_normalise wind_attitude_angles "
+            "wind_attitude_accel wind_attitude_force wind_attitude_acceleration wind_attitude_gate wind_attitude_air "
             "imu_mean horizon covariance_interval"
         ).split()
     ],
