@@ -181,7 +181,8 @@ def real(path: Path) -> dict[str, Any]:
     rows = []
     for name, preset, keys in (
         ("as-printed", "as-printed", given), ("as-printed, atan2", "as-printed", {**given, "wind_attitude.angles": "atan2"}),
-        ("as-corrected", "as-corrected", given), ("as-corrected, told of no wind", "as-corrected", {"told_wind.n": 0.0, "told_wind.e": 0.0}),
+        ("as-corrected", "as-corrected", given),
+        ("as-corrected, told of no wind", "as-corrected", {"told_wind.n": 0.0, "told_wind.e": 0.0}),
         ("as-corrected, no wind rows", "as-corrected", {"aid.airdata": "off"}), ("default", "default", {}),
     ):  # fmt: skip
         series = error_series(haltere.run(flight, "wind-attitude", preset=preset, set=keys, scored=False), flight["onboard"])

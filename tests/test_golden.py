@@ -81,7 +81,7 @@ def test_published_attitude_under_wind(preset: str, request: pytest.FixtureReque
     angles = 0.03 * rng.standard_normal((2, len(rows))) + np.array([np.arctan2(w, u), np.arcsin(v / speed)])
     columns = {"airspeed": np.maximum(speed + 0.5 * rng.standard_normal(len(rows)), 0.0), "aoa": angles[0], "sideslip": angles[1]}
     streams = {**flight.streams, "airdata": Stream({"t": truth.t[rows], **columns})}
-    keys = {"wind.n": 3.0, "wind.e": -2.0, "noise.airspeed": 0.5}
+    keys = {"told_wind.n": 3.0, "told_wind.e": -2.0, "noise.airspeed": 0.5}
     solution = run(haltere.FlightLog(streams, flight.meta), "wind-attitude", preset=preset, set=keys)
     _compare(f"wind_attitude_{preset.replace('-', '_')}", _table(solution), request.config.getoption("--update"))
 
