@@ -151,7 +151,8 @@ def fly(n: int = 100_000, rate: float = 1000.0, magnetometer: int = 10, baromete
 
 #: What the twin does not have.
 PLAIN: dict[str, Any] = {
-    "noise__gyro_scale": 0.0, "noise__field": 0.0, "robust__innovation": 1e9, "aid__compass_watch": "off", "aid__motor_field": "off",
+    "noise__gyro_scale": 0.0, "noise__between": 0.0, "noise__field": 0.0, "robust__innovation": 1e9, "aid__compass_watch": "off",
+    "aid__motor_field": "off",
 }  # fmt: skip
 
 

@@ -81,11 +81,13 @@ def circling(
         airdata["aoa"] = np.arctan2(v_a[air, 2], v_a[air, 0]) + offsets[0] + 0.02 * rng.standard_normal(n)
         airdata["sideslip"] = np.arcsin(v_a[air, 1] / V[air]) + offsets[1] + 0.02 * rng.standard_normal(n)
     k = len(t[fix])
+    field_b = np.einsum("nji,j->ni", C[mag], h) + rng.standard_normal((len(t[mag]), 3))
+    told = vel[fix] + 0.15 * rng.standard_normal((k, 3))
     streams = {
         "imu": {"t": t} | {f"gyro_{x}": w_b[:, i] + 0.015 * rng.standard_normal(len(t)) for i, x in enumerate("xyz")}
         | {f"accel_{x}": f_b[:, i] + 0.35 * rng.standard_normal(len(t)) for i, x in enumerate("xyz")},
-        "magnetometer": {"t": t[mag]} | {f"mag_{x}": np.einsum("nji,j->ni", C[mag], h)[:, i] + rng.standard_normal(len(t[mag])) for i, x in enumerate("xyz")},
-        "gnss": {"t": t[fix], "lat": lat, "lon": lon, "alt": alt} | {f"vel_{x}": vel[fix, i] + 0.15 * rng.standard_normal(k) for i, x in enumerate("ned")}
+        "magnetometer": {"t": t[mag]} | {f"mag_{x}": field_b[:, i] for i, x in enumerate("xyz")},
+        "gnss": {"t": t[fix], "lat": lat, "lon": lon, "alt": alt} | {f"vel_{x}": told[:, i] for i, x in enumerate("ned")}
         | {"s_acc": np.full(k, 0.15), "h_acc": np.full(k, 1.0), "v_acc": np.full(k, 1.5)},
         "airdata": airdata,
         "truth": {"t": t} | {f"q_{x}": q[:, i] for i, x in enumerate("wxyz")} | {f"vel_{x}": vel[:, i] for i, x in enumerate("ned")}

@@ -553,7 +553,7 @@ def test_online_bad_samples_are_left_out_and_counted() -> None:
     assert not est.offer("barometer", 3.0, {"temperature": 20.0})
     assert not est.offer("gnss", 3.0, (nan, nan, nan))
     assert not est.offer("gnss", 1.0, (46.8, 8.2, 600.0))  # long past
-    with pytest.raises(UsageError, match=r"gnss, barometer, magnetometer or power.*'lidar'"):
+    with pytest.raises(UsageError, match=r"gnss, barometer, magnetometer, power.*'lidar'"):
         est.offer("lidar", 3.0, [1.0])
     with pytest.raises(UsageError, match=r"3 to 6 values for gnss.*found 2"):
         est.offer("gnss", 3.0, (46.8, 8.2))

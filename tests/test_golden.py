@@ -14,8 +14,10 @@ import pytest
 import haltere
 from converters import ecl_replay
 from haltere.drive import run
+from haltere.flight.log import Stream
 from haltere.metrics.attitude import euler
 from haltere.simulate import demo_flight
+from haltere.simulate.truth import rotate_to_body
 
 GOLDEN = Path(__file__).parent / "golden"
 
@@ -65,6 +67,23 @@ def _compare(name: str, text: str, update: bool) -> None:
 )
 def test_demo(name: str, make: Callable[[], haltere.FlightLog], estimator: str, request: pytest.FixtureRequest) -> None:
     _compare(name, _table(run(make(), estimator)), request.config.getoption("--update"))
+
+
+@pytest.mark.parametrize("preset", ["as-corrected", "as-printed"])
+def test_published_attitude_under_wind(preset: str, request: pytest.FixtureRequest) -> None:
+    """With airspeed and vanes made of the truth, in a wind of 3 and -2 m/s that is given."""
+    flight = demo_flight(1, 60.0)
+    truth, rng = flight["truth"], np.random.default_rng(1)
+    rows = np.arange(0, len(truth), len(truth) // 1200)
+    q, ground = truth.vector("q", "wxyz")[rows], truth.vector("vel", "ned")[rows] - np.array([3.0, -2.0, 0.0])
+    u, v, w = rotate_to_body(q, ground).T
+    speed = np.sqrt(u * u + v * v + w * w)
+    angles = 0.03 * rng.standard_normal((2, len(rows))) + np.array([np.arctan2(w, u), np.arcsin(v / speed)])
+    columns = {"airspeed": np.maximum(speed + 0.5 * rng.standard_normal(len(rows)), 0.0), "aoa": angles[0], "sideslip": angles[1]}
+    streams = {**flight.streams, "airdata": Stream({"t": truth.t[rows], **columns})}
+    keys = {"told_wind.n": 3.0, "told_wind.e": -2.0, "noise.airspeed": 0.5}
+    solution = run(haltere.FlightLog(streams, flight.meta), "wind-attitude", preset=preset, set=keys)
+    _compare(f"wind_attitude_{preset.replace('-', '_')}", _table(solution), request.config.getoption("--update"))
 
 
 def test_px4_replay(shared_data: Path, request: pytest.FixtureRequest) -> None:

@@ -40,7 +40,12 @@ def _by_name(flight: FlightLog) -> dict[str, tuple[str, str, str]]:
 
 
 def test_a_complete_log_is_supported() -> None:
-    assert {s.estimator: s.verdict for s in support(_flight())} == {"navigator": "yes", "ahrs": "yes", "two-stage": "yes"}
+    assert {s.estimator: s.verdict for s in support(_flight())} == {
+        "navigator": "yes",
+        "ahrs": "yes",
+        "two-stage": "yes",
+        "wind-attitude": "yes",
+    }
 
 
 @pytest.mark.parametrize(

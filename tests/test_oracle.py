@@ -18,7 +18,7 @@ import numpy as np
 from haltere._jit import COMPILED
 from haltere.drive import run
 from haltere.estimators.base import Estimator
-from haltere.flight.log import FlightLog
+from haltere.flight.log import FlightLog, Stream
 from haltere.simulate import demo_flight
 
 demo = demo_flight(3, 24.0, imu_rate=100.0)
@@ -35,6 +35,19 @@ for name, options in (
     out |= {f"{name}.{k}": v for k, v in solution.table.items()} | {f"{name}.aid.{k}": v for k, v in solution.aids.items()}
     out |= {f"{name}.P.{k}": v for k, v in solution.covariance.items()}
     out[f"{name}.events"] = np.array([f"{e['kind']} {e['sensor']} {e['t_onset']:.6f}" for e in solution.events])
+rng, truth = np.random.default_rng(3), flight["truth"]
+t = np.arange(2.6, 7.4, 0.05)
+speed, angles = 5.0 + rng.standard_normal(len(t)), 0.1 * rng.standard_normal((2, len(t)))
+flight.streams["airdata"] = Stream({"t": t, "airspeed": speed, "aoa": angles[0], "sideslip": angles[1]})
+flight.streams["wind"] = Stream({"t": t[::40], "wind_n": 3.0 + 0.0 * t[::40], "wind_e": t[::40], "sd": 1.0 + 0.0 * t[::40]})
+for name, preset, options in (
+    ("published", "as-corrected", {"wind_attitude.integrator": "rk4"}),
+    ("printed", "as-printed", {}),
+    ("dragged", "as-corrected", {"wind_attitude.air": "drag", "wind_attitude.integrator": "exp", "aid.airdata": "off"}),
+):
+    solution = run(flight, "wind-attitude", preset=preset, set=options)
+    out |= {f"{name}.{k}": v for k, v in solution.table.items()} | {f"{name}.aid.{k}": v for k, v in solution.aids.items()}
+del flight.streams["airdata"], flight.streams["wind"]
 est, imu, mag, j = Estimator("ahrs"), flight["imu"], flight["magnetometer"], 0
 for i in range(300):
     while j < len(mag) and mag.t[j] <= imu.t[i]:
@@ -99,5 +112,8 @@ def test_the_twins_saw_every_sensor(twins: tuple[dict[str, np.ndarray], dict[str
     assert "mag_x" in plain["late.aid.component"]
     assert not (plain["mean.aid.sensor"] == "magnetometer").any()
     assert {"field_east", "vel_n", "pos_n"} <= set(plain["two-stage.aid.component"])
+    assert {"down_x", "field_y", "air_z"} <= set(plain["published.aid.component"])
+    assert {"down_x", "field_y", "air_z"} <= set(plain["printed.aid.component"])
+    assert set(plain["dragged.aid.sensor"]) >= {"accelerometer", "drag"}
     assert len(plain["online.records"]) > 50
     assert any(e.startswith("aligned") for e in plain["navigator.events"])

@@ -12,15 +12,17 @@ from scipy.spatial.transform import Rotation
 
 import haltere
 from haltere import drive
+from haltere.aids.air import calm
 from haltere.drive import run
 from haltere.estimators.base import Estimator, InitialState
 from haltere.flight.log import FlightLog, Stream
 from haltere.metrics.consistency import DOF, band, nees_series
 from haltere.metrics.errors import error_series
-from haltere.simulate import demo_flight
+from haltere.simulate import Scenario, demo_flight, simulate
 from test_consistency import _start
 
 FloatArray = NDArray[np.float64]
+OPTIONAL = ("baro", "wind", "drag", "steady")
 AXES = {"vel": "ned", "pos": "ned", "gyro_bias": "xyz", "accel_bias": "xyz"}
 
 
@@ -52,7 +54,7 @@ class Oracle:
         raw = np.c_[imu.vector("gyro"), imu.vector("accel")]
         offers = sorted(
             (float(t), rank, name, i)
-            for rank, name in enumerate(("gnss", "barometer", "magnetometer"))
+            for rank, name in enumerate(("gnss", "barometer", "magnetometer", "rotors"))
             if name in flight
             for i, t in enumerate(flight[name].t)
         )
@@ -67,7 +69,8 @@ class Oracle:
             if s.aligned and (not t or s.t > t[-1]):
                 assert not t or s.t == imu.t[rows[-1] + 1]  # a row at every sample
                 copy = est.state
-                x.append((copy.q_nb, np.r_[copy.vel_n, copy.pos_n, copy.gyro_bias_b, copy.accel_bias_b, copy.record["baro"][0]]))
+                optional = [copy.record[block][0] for block in OPTIONAL]
+                x.append((copy.q_nb, np.r_[copy.vel_n, copy.pos_n, copy.gyro_bias_b, copy.accel_bias_b, *optional]))
                 t.append(copy.t)
                 P.append(copy.P)
                 rows.append(int(np.searchsorted(imu.t, copy.t)))
@@ -95,8 +98,20 @@ class Oracle:
         F[3:6, :3], F[3:6, 12:15] = -h * C @ skew(f), -h * C
         F[6:9, 3:6], F[6:9, :3], F[6:9, 12:15] = h * np.eye(3), -0.5 * h * h * C @ skew(f), -0.5 * h * h * C
         gyro, accel, wg, wa = (self.number(f"noise.{s}") ** 2 for s in ("gyro", "accel", "gyro_bias", "accel_bias"))
-        Q = [gyro * h + wg * h**3 / 3.0] * 3 + [accel * h] * 3 + [accel * h**3 / 3.0] * 3 + [wg * h] * 3 + [wa * h] * 3
-        Q += [self.number("noise.baro_bias") ** 2 * h] * (n - 15)
+        Q: Any = [gyro * h + wg * h**3 / 3.0] * 3 + [accel * h] * 3 + [accel * h**3 / 3.0] * 3 + [wg * h] * 3 + [wa * h] * 3
+        gyro_step, force_step = (self.raw[k + 1] - self.raw[k]).reshape(2, 3)
+        missed = (self.number("noise.between") * h) ** 2  # of the course between two samples
+        Q[:6] = list(np.array(Q[:6]) + missed * np.r_[gyro_step**2, np.full(3, force_step @ force_step / 3.0)])
+        Q += [self.number("noise.baro_bias") ** 2 * h] * min(n - 15, 1)
+        if n > 16:  # wind as its force at hover, ln mu, ln c, two offsets, the mean of the force
+            keep = np.exp(-h / self.number("air.gust_time"))
+            F[16:18, 16:18], F[16:18, 22:24] = keep * np.eye(2), (1.0 - keep) * np.eye(2)
+            new[13:15] = keep * v[13:15] + (1.0 - keep) * v[19:21]
+            mu, c, mean = np.exp(v[15]), np.exp(v[16]), np.hypot(*v[19:21])
+            per_wind = np.sqrt(mu * mu + 4.0 * c * mean)
+            gust = per_wind * (self.number("air.gust") + self.number("air.turbulence") * (per_wind - mu) / (2.0 * c))
+            Q += [gust**2 * (1.0 - keep**2)] * 2 + [self.number("noise.air_walk") ** 2 * h] * 4
+            Q += [(per_wind * self.number("noise.wind_mean")) ** 2 * h] * 2
         return R * Rotation.from_rotvec(turn), new, F, F @ self.P[k] @ F.T + np.diag(Q)
 
     def before_assumptions(self, nodes: FloatArray) -> dict[int, tuple[Rotation, FloatArray, FloatArray]]:
@@ -157,9 +172,14 @@ class Oracle:
         return x, P
 
 
-@pytest.mark.parametrize("estimator", ["navigator", "ahrs"])
+@pytest.mark.parametrize("estimator", ["navigator", "ahrs", "wind"])
 def test_it_is_the_dense_smoother_of_the_textbook(estimator: str) -> None:
     flight = part(demo_flight(3, 24.0), 2.0, 8.0)
+    if estimator == "wind":
+        flight = part(
+            simulate(Scenario(mission="figure-eight", duration=30.0, rest=0.0, seed=4, tell_noise=True, wind={"n": 4.0})), 8.0, 14.5
+        )
+        flight, estimator = flight.without("truth", "power"), "navigator"
     prompt = {f"delay.{k}": 0.0 for k in ("gnss", "barometer", "magnetometer")}
     solution = run(flight, estimator, set=prompt, smooth=True)
     oracle = Oracle(flight, solution)
@@ -180,6 +200,12 @@ def test_it_is_the_dense_smoother_of_the_textbook(estimator: str) -> None:
                 assert np.abs(ratio - 1.0).max() < 0.01, (stem, a)  # linear between the nodes
                 assert np.mean(np.abs(ratio - 1.0) < 1e-8) > 0.15, (stem, a)  # and exact at them
             column += 1
+    if "drag_mu" in s:
+        drag = np.column_stack([np.log(s["drag_mu"]), np.log(s["drag_c"]), s["drag_offset_x"], s["drag_offset_y"]])
+        assert np.abs((drag - values[:, 15:19]) / sd[:, 18:22]).max() < 1e-8
+        assert np.abs(s["sd_drag_mu"] / s["drag_mu"] / sd[:, 18] - 1.0).max() < 0.01
+        wind = np.array([calm(*a, np.exp(u), np.exp(c)) for a, u, c in zip(values[:, 13:15], values[:, 15], values[:, 16], strict=True)])
+        assert np.abs((s["wind_n"] - wind[:, 0]) / s["sd_wind_n"]).max() < 1e-8
     if "baro_bias" in s:
         assert np.abs(s["baro_bias"] - values[:, 12]).max() < 1e-8 * sd[:, 15].min()
     c = s.covariance
@@ -341,7 +367,7 @@ def _scores(flights: int, first: int) -> tuple[dict[str, float], dict[str, list[
 
 
 def _judge(nees: dict[str, float], squares: dict[str, list[float]], flights: int) -> None:
-    assert set(nees) == set(DOF)
+    assert set(nees) == set(DOF) - {"wind"}  # nothing in these flights feels the air
     for block, value in nees.items():
         low, high = band(DOF[block], float(flights), 0.999)
         assert low < value < high, (block, value, low, high)

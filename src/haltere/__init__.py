@@ -75,12 +75,14 @@ if TYPE_CHECKING:
     from haltere.flight.given_wind import with_wind
     from haltere.flight.log import FlightLog, FlightMeta, Home, Stream
     from haltere.flight.solution import Solution
+    from haltere.identify.drag import identify_drag
+    from haltere.identify.vehicle import identify_vehicle
     from haltere.readers import read
     from haltere.simulate import Scenario, inject, simulate
 
 __all__ = [
     "Estimator", "FlightLog", "FlightMeta", "HaltereError", "Home", "Scenario", "Solution", "Stream", "__version__",
-    "calibrate_magnetometer", "campaign", "compare", "inject", "read", "run", "simulate", "with_wind",
+    "calibrate_magnetometer", "campaign", "compare", "identify_drag", "identify_vehicle", "inject", "read", "run", "simulate", "with_wind",
 ]  # fmt: skip
 
 # Where each public name lives: loaded at its first use, so that `import haltere` costs no numba, polars or scipy.
@@ -96,6 +98,8 @@ _HOME = {
     "calibrate_magnetometer": "haltere.calibrate.magnetometer",
     "campaign": "haltere.evaluate.campaign",
     "compare": "haltere.evaluate.compare",
+    "identify_drag": "haltere.identify.drag",
+    "identify_vehicle": "haltere.identify.vehicle",
     "inject": "haltere.simulate",
     "read": "haltere.readers",
     "run": "haltere.drive",

@@ -16,11 +16,11 @@ from haltere.aids.compass import OUT_APART, OUT_FIELD, OUT_TURN
 from haltere.aids.record import AID_RECORD, COMPONENTS, EVENTS, N_QUEUED, REASONS, SENSORS, STATUSES, YAW_BANK
 from haltere.diagnosis.findings import findings
 from haltere.errors import HaltereError, UsageError
-from haltere.estimators import step as kernels
 from haltere.estimators.base import InitialState, new_state
 from haltere.estimators.inputs import Measurements, configure, imu_arrays, measurements, parameters, request
-from haltere.estimators.registry import SPECIFICATIONS
+from haltere.estimators.registry import SPECIFICATIONS, kernels_of
 from haltere.estimators.smoother import node_width, smoothed
+from haltere.estimators.step import COVARIANCE_ROWS
 from haltere.flight.config import Config
 from haltere.flight.corrections import correct
 from haltere.flight.door import Checked, check, fit
@@ -61,7 +61,7 @@ def run(
     flight
         The log. Streams ``onboard`` and ``truth`` are compared with afterwards and never read by the estimator.
     estimator
-        ``navigator``, ``ahrs`` or ``two-stage``.
+        ``navigator``, ``ahrs``, ``two-stage`` or ``wind-attitude``.
 
     Other Parameters
     ----------------
@@ -104,6 +104,9 @@ def run(
     asked = request(flight, estimator, preset, config, set)
     if smooth and asked["magnetometer.refine"] == "on":
         raise UsageError("magnetometer.refine=off with a smoothed run", "on", "--smooth", "the smoother does not know those states yet")
+    attitude_only = asked["wind_attitude.filter"] == "quaternion"
+    if smooth and attitude_only:
+        raise UsageError("no smoothing of the published filter", f"{estimator}, preset {preset}", "--smooth", "preset default has it")
     flight = correct(flight, asked.values)
     blind = flight.without("onboard", "truth")
     checked = check(blind, upright=estimator != "ahrs", given=asked.values)
@@ -114,7 +117,7 @@ def run(
     prepared = time.perf_counter()
 
     S, prm = new_state(resolved, initial), parameters(resolved)
-    cov = np.empty((kernels.COVARIANCE_ROWS, min(int((t[-1] - t[0]) / 0.1), len(t)) + 64))
+    cov = np.empty((COVARIANCE_ROWS, min(int((t[-1] - t[0]) / 0.1), len(t)) + 64))
     rows, aids_parts, events, nodes = _loop(S, prm, t, gyro, accel, offered, cov, progress, smooth)
     filtered = time.perf_counter()
 
@@ -125,7 +128,7 @@ def run(
             f"{t[-1] - t[0]:.1f} s of IMU that allowed none", f"{flight.meta.name or 'flight'}: initial alignment",
             "give the estimator a longer stretch of data, or an initial state",
         )  # fmt: skip
-    table = _table(rows, S, specification.POSITION)
+    table = _attitude(rows) if attitude_only else _table(rows, S, specification.POSITION)
     if rate is not None:
         keep = _decimate(table["t"], rate)
         table = {name: column[keep] for name, column in table.items()}
@@ -171,6 +174,7 @@ def _loop(
 
     The last of what comes back is the tape for smoothing, empty where none is wanted.
     """
+    kernels = kernels_of(S)
     width = int(kernels.row_width(S["P"].shape[1]))
     columns = np.empty((width, len(t)))
     chunk = np.empty((CHUNK + 4 * IMU_CAPACITY, width))
@@ -210,7 +214,7 @@ def _unwatched(
 ) -> FloatArray:
     """Heading [rad] at the times ``at`` (k,) of the same filter hearing its compass to the end: what a disturbance would have done."""
     deaf = config.changed(aid__compass_watch="off")
-    rows = _loop(new_state(deaf, initial), parameters(deaf), t, gyro, accel, m, np.empty((kernels.COVARIANCE_ROWS, 0)), None, False)[0]
+    rows = _loop(new_state(deaf, initial), parameters(deaf), t, gyro, accel, m, np.empty((COVARIANCE_ROWS, 0)), None, False)[0]
     w, x, y, z = rows[1:5]
     yaw = np.unwrap(np.arctan2(2.0 * (x * y + w * z), w * w + x * x - y * y - z * z))
     return np.asarray(np.interp(at, rows[0], yaw)) if rows.shape[1] else np.full(len(at), np.nan)
@@ -314,6 +318,13 @@ def _optional(rows: FloatArray, S: NDArray[np.void]) -> tuple[dict[str, FloatArr
     return values, deviations
 
 
+def _attitude(rows: FloatArray) -> dict[str, FloatArray]:
+    """Columns of a filter that estimates nothing else."""
+    sd = _euler_sd(rows[1:5], rows[17:23])
+    q = {f"q_{a}": rows[1 + k] for k, a in enumerate("wxyz")}
+    return {"t": rows[0]} | q | dict(zip(("sd_roll", "sd_pitch", "sd_yaw"), sd, strict=True))
+
+
 def _euler_sd(q: FloatArray, P: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
     """1 sigma of roll, pitch, yaw [rad] from the body-frame error covariance, first order, at most pi.
 
@@ -362,6 +373,8 @@ def _covariance(cov: FloatArray, n: int) -> dict[str, FloatArray]:
     where = np.array([[0, 1, 2], [1, 3, 4], [2, 4, 5]])
     for b, name in enumerate(("attitude", "velocity", "position", "gyro_bias", "accel_bias")):
         out[name] = np.ascontiguousarray(cov[1 + 6 * b : 7 + 6 * b, :n].T[:, where])
+    if n and not np.isfinite(cov[7, :n]).any():  # attitude alone
+        return {"t": out["t"], "attitude": out["attitude"]}
     if np.isfinite(cov[31, :n]).any():
         out["baro_bias"] = np.ascontiguousarray(cov[31, :n].reshape(-1, 1, 1))
     if np.isfinite(cov[32, :n]).any():

@@ -16,6 +16,8 @@ __all__ = ["AID_RECORD", "COMPONENTS", "EVENTS", "REASONS", "SENSORS", "STATUSES
 #: hypotheses, which speaks of GNSS velocity.
 GNSS_VELOCITY, GNSS_POSITION, BAROMETER, MAGNETOMETER, POWER, ROTORS, AIRSPEED, VANES, WIND, ATTITUDE = (constant(i) for i in range(10))
 ZERO_VELOCITY, ZERO_RATE, DRAG, NO_SIDESLIP, FAKE_POSITION, FAKE_VELOCITY, YAW_BANK = (constant(i) for i in range(10, 17))
+#: Only the published quaternion filter (`wind-attitude`) hears gravity from the accelerometer; of `VANES` and `DRAG` it hears vectors.
+ACCELEROMETER = constant(17)
 N_QUEUED = 10
 #: Sensor of an event that no sensor made.
 NO_SENSOR = constant(0)
@@ -24,23 +26,29 @@ NO_DETAIL = constant(0)
 SENSORS = (
     "gnss", "gnss", "barometer", "magnetometer", "power", "rotors", "airdata", "airdata", "wind", "attitude",
     "zero_velocity", "zero_rate", "drag", "no_sideslip", "fake_position", "fake_velocity", "gnss",
+    "accelerometer",
 )  # fmt: skip
 
 COMPONENTS = (
     "vel_n", "vel_e", "vel_d", "pos_n", "pos_e", "pos_d", "altitude", "heading", "mag_x", "mag_y", "mag_z", "rate_x", "rate_y", "rate_z",
     "field_east", "field_down", "field_north", "airspeed", "aoa", "sideslip", "drag_x", "drag_y", "wind_n", "wind_e", "wind_d",
-    "attitude_x", "attitude_y", "attitude_z",
+    "attitude_x", "attitude_y", "attitude_z", "down_x", "down_y", "down_z", "field_x", "field_y", "field_z", "air_x", "air_y", "air_z",
 )  # fmt: skip
 C_VEL, C_POS, C_ALTITUDE, C_HEADING, C_MAG, C_RATE, C_FIELD = (constant(i) for i in (0, 3, 6, 7, 8, 11, 14))
 C_AIRSPEED, C_AOA, C_SIDESLIP, C_DRAG, C_WIND, C_ATTITUDE = (constant(i) for i in (17, 18, 19, 20, 22, 25))
+C_DOWN, C_UNIT_FIELD, C_AIR = (constant(i) for i in (28, 31, 34))
 
 STATUSES = ("fused", "deweighted", "rejected", "held")
 FUSED, DEWEIGHTED, REJECTED, HELD = (constant(i) for i in range(4))
 
-REASONS = ("", "innovation", "timeout", "start", "field strength", "dip", "no horizontal field", "alignment", "distrusted", "disturbed")
+REASONS = (
+    "", "innovation", "timeout", "start", "field strength", "dip", "no horizontal field", "alignment", "distrusted", "disturbed",
+    "acceleration",
+)  # fmt: skip
 R_NONE, R_INNOVATION, R_TIMEOUT, R_START, R_STRENGTH, R_DIP, R_HORIZONTAL, R_ALIGNMENT, R_DISTRUSTED, R_DISTURBED = (
     constant(i) for i in range(10)
 )
+R_ACCELERATION = constant(10)
 
 #: The last three are findings of `haltere.diagnosis`: a fault that is named, one of several, and the end of one.
 EVENTS = ("aligned", "reset", "diverged", "realigned", "gap", "recovered", "timeout", "disturb", "fault", "suspect", "over")

@@ -9,7 +9,7 @@ from haltere._jit import constant, jit
 from haltere.aids.air import SILENT, AirOffer, air_velocity, core_blocks, memory, moves, quadratic_block, single, wind_block
 from haltere.aids.fusing import ONE, RUNNING
 from haltere.aids.record import AIRSPEED, C_AOA, C_SIDESLIP, R_NONE, VANES
-from haltere.core.rotation import Vec, dcm, norm
+from haltere.core.rotation import Vec, dcm, norm, wrap
 from haltere.filter.robust import IGG3
 from haltere.filter.update import NONE
 
@@ -55,10 +55,13 @@ def offer(s: Any, prm: Any, m: Any) -> AirOffer:
     first = (theta, vel, quadratic_block(s, e), wind_block(s, e, 0.0), single(o + 1, 1.0))
     theta, vel, e = core_blocks(C, v_a, db)
     second = (theta, vel, quadratic_block(s, e), wind_block(s, e, 0.0), single(o + 2, 1.0))
+    # the direction of a flow that is known to σ_V; that of its part in the plane of symmetry, for the angle of attack
     slow = prm.noise_airspeed / speed
+    slow_alpha = prm.noise_airspeed / max(math.sqrt(v_a[0] * v_a[0] + v_a[2] * v_a[2]), 1e-3)
     shared = memory(s, VANES, m.t, prm.noise_airdata_time)
-    r = (prm.noise_aoa * prm.noise_aoa + slow * slow, prm.noise_sideslip * prm.noise_sideslip + slow * slow, 1.0)
-    z, h = (m.z[0], m.z[1], 0.0), (alpha + s.vane[1], beta + s.vane[2], 0.0)
+    r = (prm.noise_aoa * prm.noise_aoa + slow_alpha * slow_alpha, prm.noise_sideslip * prm.noise_sideslip + slow * slow, 1.0)
+    h = (alpha + s.vane[1], beta + s.vane[2], 0.0)
+    z = (h[0] + wrap(m.z[0] - h[0]), m.z[1], 0.0)  # backwards through the air it is half a turn, of either sign
     return TWO, C_AOA, z, h, r, (first, second, second), prm.gate_air, prm.timeout_air, R_NONE, moves(s, prm), (IGG3, 2.5, 1.0, shared)
 
 

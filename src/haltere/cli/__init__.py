@@ -60,12 +60,16 @@ def _common(
 def _run(
     log: Log,
     estimator: Annotated[
-        str | None, typer.Option("--estimator", metavar="E", help="navigator (default), ahrs or two-stage.", show_default=False)
+        str | None,
+        typer.Option("--estimator", metavar="E", help="navigator (default), ahrs, two-stage or wind-attitude.", show_default=False),
     ] = None,
     preset: Annotated[
         str | None,
         typer.Option(
-            "--preset", metavar="P", help="Named set of parameters; two-stage has as-corrected and as-printed.", show_default=False
+            "--preset",
+            metavar="P",
+            help="Named set of parameters; two-stage and wind-attitude have as-corrected and as-printed.",
+            show_default=False,
         ),
     ] = None,
     config: Annotated[
@@ -206,6 +210,57 @@ def _calibrate_magnetometer(
     magnetometer(
         log, method=method, load=load, stream=stream, config=config, assignments=set_ or [], out=out, columns=columns, column=column,
         json=json, show=open_,
+    )  # fmt: skip
+
+
+@app.command(
+    "identify",
+    short_help="The vehicle from its flights; --drag: in wind.",
+    help="Identify a vehicle from flights with rotor speeds: forces and moments with their uncertainty, to a vehicle file, tested on "
+    "flights not fitted. --drag needs no rotor speeds: the drag that the wind estimation of PX4 and ArduPilot needs (EKF2_MCOEF, "
+    "EKF2_BCOEF_X/Y, EK3_DRAG_*) and haltere's own, jointly with the wind, with its uncertainty, ready to paste. Refused where the flights "
+    "do not tell it.",
+)
+def _identify(
+    logs: Annotated[list[Path], typer.Argument(metavar="LOG...", help="Logs or flight folders of one vehicle.", show_default=False)],
+    drag: Annotated[bool, typer.Option("--drag", help="Only drag and wind.")] = False,
+    preset: Annotated[str, typer.Option("--preset", metavar="P", help="Set of columns: full, rate or literal.")] = "full",
+    vehicle: Annotated[
+        str | None,
+        typer.Option("--vehicle", metavar="F", help="Vehicle file or name whose geometry is checked and used.", show_default=False),
+    ] = None,
+    validate: Annotated[
+        list[Path] | None,
+        typer.Option("--validate", metavar="LOG", help="A flight to predict, not fitted. May be repeated.", show_default=False),
+    ] = None,
+    still: Annotated[
+        bool | None,
+        typer.Option("--still/--windy", help="Take the air for still, or fit wind. Default: by the flight.", show_default=False),
+    ] = None,
+    config: Annotated[
+        Path | None, typer.Option("--config", metavar="F", help="Configuration file, as of a run.", show_default=False)
+    ] = None,
+    set_: Annotated[
+        list[str] | None,
+        typer.Option("--set", metavar="KEY=VALUE", help="One key, e.g. baro.temperature=293. May be repeated.", show_default=False),
+    ] = None,
+    out: Annotated[
+        Path | None,
+        typer.Option("--out", metavar="F", help="vehicle.toml, or folder. Default: ./<log>.haltere", show_default=False),
+    ] = None,
+    columns: Columns = None,
+    column: Column = None,
+    json: Json = False,
+    open_: Open = False,
+) -> None:
+    from haltere.cli import identify
+
+    if drag:
+        identify.drag(logs, config=config, assignments=set_ or [], out=out, columns=columns, column=column, json=json, show=open_)
+        return
+    identify.vehicle(
+        logs, preset=preset, vehicle=vehicle, validate=validate or [], still=still, config=config, assignments=set_ or [], out=out,
+        columns=columns, column=column, json=json, show=open_,
     )  # fmt: skip
 
 

@@ -69,6 +69,8 @@ OTHERS = 2.0
 BEYOND_USUAL, BLOCK, RISE, FALL, CAP = 2.0, 10.0, 0.6, 0.1, 2.0
 #: Least information on a size, in 1/(unit)^2.
 LEAST = 1.0
+#: GNSS velocity speaks if it did so long ago [s].
+SPOKEN = 3.0
 #: From this uncertainty of attitude on the bank listens: 1 sigma of tilt and of yaw [rad].
 TILT_KNOWN, YAW_KNOWN = math.radians(5.0), math.radians(25.0)
 
@@ -143,7 +145,9 @@ def next_slot(b: Any, t: float) -> int:
 
 @jit
 def known(s: Any) -> bool:
-    """Whether the attitude is known well enough for linear responses."""
+    """Whether the attitude is known well enough for linear responses, and GNSS speaks: without it nothing tells one axis from another."""
+    if s.t - s.aid[GNSS_VELOCITY].t_offered > SPOKEN:
+        return False
     return compass.tilt_variance(s) < TILT_KNOWN * TILT_KNOWN and compass.yaw_sd(s) < YAW_KNOWN
 
 

@@ -48,7 +48,7 @@ from haltere.core.rotation import (
 from haltere.estimators import yaw_bank
 from haltere.filter.queue import pop_due
 
-__all__ = ["AT_REST", "GIVEN", "GRAVITY_ONLY", "IN_MOTION", "begin", "gather", "level_and_compass"]
+__all__ = ["AT_REST", "GIVEN", "GRAVITY_ONLY", "IN_MOTION", "begin", "gather", "level_and_compass", "start_air"]
 
 AT_REST, IN_MOTION, GRAVITY_ONLY, TWO_SPANS, GIVEN = (constant(i) for i in (1, 2, 3, 4, 5))
 #: Longest wait [s] for a compass at rest, and for GNSS or rest before gravity alone must do.
@@ -203,7 +203,7 @@ def start_air(s: Any, prm: Any, o: int) -> None:
         P[k, k] = sd * sd
         scale = prm.drag_mu
     for i in range(len(s.wind)):
-        gust = scale * prm.wind_gust
+        gust = scale * prm.air_gust
         s.wind[i] = 0.0
         P[o + i, o + i] = gust * gust if i < 2 else 0.25 * gust * gust
     for i in range(len(s.steady)):  # all that is known of the wind before any is felt is known of its mean

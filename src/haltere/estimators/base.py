@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from haltere._jit import as_records
+from haltere.aids.air_vector import ENOUGH
 from haltere.aids.record import (
     AID_RECORD,
     AIRSPEED,
@@ -26,8 +27,10 @@ from haltere.aids.record import (
 )
 from haltere.core.earth import STANDARD_GRAVITY, gravity
 from haltere.errors import HaltereError, UsageError
-from haltere.estimators import step as kernels
+from haltere.estimators import quaternion_step
+from haltere.estimators.air import steady_wind, vanes
 from haltere.estimators.inputs import altitude_of, parameters, rotation_vector
+from haltere.estimators.registry import kernels_of
 from haltere.flight import config as configuration
 from haltere.flight.config import Config
 from haltere.flight.corrections import calibrated, calibration
@@ -35,6 +38,7 @@ from haltere.flight.door import impossible_place, impossible_pressure
 from haltere.flight.names import nearest_column, nearest_stream
 from haltere.flight.schema import column as schema_column
 from haltere.strapdown.layout import CORE, layout
+from haltere.strapdown.quaternion import quaternion_layout
 
 __all__ = ["Estimator", "InitialState", "State", "new_state"]
 
@@ -115,7 +119,8 @@ class InitialState:
     q_nb, vel_n, pos_n, gyro_bias_b, accel_bias_b
         Nominal state, SI units.
     P
-        Covariance (n, n) in the order of `State.P`.
+        Covariance (n, n) in the order of `State.P`, or of it without wind and coefficients of the air, which then begin as configured.
+        The published filter of `wind-attitude` takes only that of the attitude error, the first three rows and columns.
     baro_bias
         Barometer offset [m].
     """
@@ -132,7 +137,8 @@ class InitialState:
 
 def new_state(config: Config, initial: InitialState | None = None) -> NDArray[np.void]:
     """State record, one element, that has seen nothing yet."""
-    record = as_records(np.zeros(1, layout(**_sizes(config))))
+    quaternion = config["wind_attitude.filter"] == "quaternion"
+    record = as_records(np.zeros(1, quaternion_layout() if quaternion else layout(**_sizes(config))))
     record["q"][0, 0] = 1.0
     home = (config.number("home.lat"), config.number("home.lon"), config.number("home.alt"))
     record["gravity"] = STANDARD_GRAVITY
@@ -146,9 +152,42 @@ def new_state(config: Config, initial: InitialState | None = None) -> NDArray[np
     if not (math.isnan(dip) or math.isnan(strength)):
         record["field"][0, 1:] = dip, strength
         record["has_field"] = 1
+    if quaternion:
+        _published(record, config)
     if initial is not None:
-        _begin_from(record, initial)
+        if quaternion:
+            _begin_quaternion(record, initial)
+        else:
+            _begin_from(record, config, initial)
     return record
+
+
+def _published(record: NDArray[np.void], config: Config) -> None:
+    """What the published filter knows from the start: the wind as given."""
+    record["x"][0, 0] = 1.0
+    record["t_gnss"] = record["air"]["t_rotors"] = -1e9
+    wind = steady_wind(config.values)
+    if wind is not None:
+        record["wind_v"][0], record["wind_r"], record["has_wind"] = wind, config.number("told_wind.sd") ** 2, 1
+    elif config["wind_attitude.rows"] == "printed":  # which have no wind in them
+        record["has_wind"] = 1
+
+
+def _begin_quaternion(record: NDArray[np.void], initial: InitialState) -> None:
+    """Attitude and the covariance of its error; the other states are not there."""
+    P = np.asarray(initial.P, dtype=np.float64)
+    if P.ndim != 2 or P.shape[0] != P.shape[1] or len(P) < 3:
+        raise HaltereError("an initial covariance of shape (3, 3), of the attitude error", f"{P.shape}", "initial state")
+    V = P[:3, :3]
+    if not np.allclose(V, V.T, rtol=1e-9, atol=1e-15) or np.linalg.eigvalsh(V).min() <= 0.0:
+        raise HaltereError("a symmetric positive covariance", "one that is not", "initial state")
+    q = np.asarray(initial.q_nb, dtype=np.float64)
+    if q.shape != (4,) or not np.isfinite(q).all() or not q.any():
+        raise HaltereError("4 finite numbers for q_nb", f"{q.tolist()}", "initial state")
+    record["t"] = record["t_block"] = record["t_aligned"] = _number(initial.t, "t", "initial state")
+    record["q"][0] = record["x"][0] = q / np.linalg.norm(q)
+    a, b, c = ((float(x), float(y), float(z)) for x, y, z in V)
+    quaternion_step.begin_at(record, (a, b, c))
 
 
 def _sizes(config: Config) -> dict[str, int]:
@@ -166,10 +205,12 @@ def _sizes(config: Config) -> dict[str, int]:
     }
 
 
-def _begin_from(record: NDArray[np.void], initial: InitialState) -> None:
+def _begin_from(record: NDArray[np.void], config: Config, initial: InitialState) -> None:
     n = record["P"].shape[1]
     P = np.asarray(initial.P, dtype=np.float64)
-    if P.shape != (n, n):
+    sizes = _sizes(config)
+    told = CORE + sizes["baro"] + sizes["mag"]  # without the states of the air: these begin as configured
+    if P.shape not in ((n, n), (told, told)):
         raise HaltereError(f"an initial covariance of shape ({n}, {n})", f"{P.shape}", "initial state", "see State.P for the order")
     if not np.allclose(P, P.T, rtol=1e-9, atol=1e-15) or np.linalg.eigvalsh(P).min() <= 0.0:
         raise HaltereError("a symmetric positive covariance", "one that is not", "initial state")
@@ -183,7 +224,8 @@ def _begin_from(record: NDArray[np.void], initial: InitialState) -> None:
     if n > CORE:
         record["baro"][0, 0] = initial.baro_bias
     record["q"][0] /= np.linalg.norm(record["q"][0])
-    record["P"][0] = P
+    kernels_of(record).begin_air(record, parameters(config))
+    record["P"][0, : len(P), : len(P)] = P
     for field in ("q", "v", "p", "bg", "ba"):
         record["a"][field][0] = record[field][0]
     record["a"]["P"][0] = P[:CORE, :CORE]
@@ -203,7 +245,7 @@ class Estimator:
     Parameters
     ----------
     name
-        ``navigator``, ``ahrs`` or ``two-stage``.
+        ``navigator``, ``ahrs``, ``two-stage`` or ``wind-attitude``.
     config
         A complete `Config`, or a mapping of configuration keys to change. Home and field that are not given are taken from
         the first fix (origin) and from the first magnetometer samples (field); declination is then 0.
@@ -238,7 +280,8 @@ class Estimator:
             )  # fmt: skip
         self._calibration = calibration(self.config.values)
         self._S = new_state(self.config, initial)
-        self._stage = kernels.stage_of(self._S)
+        self._kernels = kernels_of(self._S)
+        self._stage = self._kernels.stage_of(self._S)
         self._prm = parameters(self.config)
         self._aids = as_records(np.empty(4096, AID_RECORD))
         self._now = np.zeros(11)
@@ -265,7 +308,7 @@ class Estimator:
         UsageError
             Not three numbers each.
         """
-        kernels.step(
+        self._kernels.step(
             self._S, self._prm, _number(t, "t", "Estimator.step"), _three(gyro, "gyro"), _three(accel, "accel"),
             _NO_ROWS, _NO_ROWS, self._aids, _NO_ROWS, self._stage,
         )  # fmt: skip
@@ -372,10 +415,15 @@ class Estimator:
 
     def _offer_of_the_air(self, sensor: str, t: float, values: Sequence[float] | Mapping[str, float]) -> bool:
         if sensor == "rotors":
-            speeds = values.values() if isinstance(values, Mapping) else _flat(values, "values of rotors")
+            named = [v for k, v in values.items() if str(k).startswith("speed_")] if isinstance(values, Mapping) else None
+            if named == []:
+                raise UsageError("values of rotors by name (speed_0, speed_1, ...)", ", ".join(map(repr, values)), "Estimator.offer")
+            speeds = named or _flat(values, "values of rotors")
             total = sum(abs(_number(x, "a rotor's speed", "Estimator.offer")) for x in speeds)
             return self._queue(ROTORS, t, (total, math.nan, math.nan), _NAN) if math.isfinite(total) else self._refuse(sensor, "not finite")
         v = _in_order(sensor, values, {"airdata": 1, "wind": 2, "attitude": 4}[sensor])
+        if sensor == "airdata" and self._kernels is quaternion_step:
+            return self._offer_air_vector(t, v)
         if sensor == "airdata":
             taken = math.isfinite(v[0]) and self._queue(AIRSPEED, t, (v[0], math.nan, math.nan), _NAN)
             vanes = math.isfinite(v[1] + v[2]) and self._queue(VANES, t, (v[1], v[2], math.nan), _NAN)
@@ -390,8 +438,17 @@ class Estimator:
         x, y, z = rotation_vector(np.array([v]))[0].tolist()
         return self._queue(ATTITUDE, t, (x, y, z), _NAN)
 
+    def _offer_air_vector(self, t: float, v: tuple[float, ...]) -> bool:
+        """Air data of the published filter, which hears them as a vector, see `haltere.estimators.air`."""
+        if not math.isfinite(sum(v)):
+            return self._refuse("airdata", "no vane" if math.isfinite(v[0]) else "not finite")
+        if v[0] < ENOUGH * self.config.number("noise.airspeed"):
+            return self._refuse("airdata", "airspeed below three times its noise")
+        z, r = (a[0].tolist() for a in vanes(np.array([v]), self.config))
+        return self._queue(VANES, t, (z[0], z[1], z[2]), (r[0], r[1], r[2]))
+
     def _queue(self, kind: int, t: float, z: tuple[float, float, float], r: tuple[float, float, float]) -> bool:
-        return bool(kernels.offer(self._S, self._prm, kind, t, z, r) in (1, -1))
+        return bool(self._kernels.offer(self._S, self._prm, kind, t, z, r) in (1, -1))
 
     def _refuse(self, sensor: str, reason: str) -> bool:
         """Count a measurement that was not taken; always False."""
@@ -417,14 +474,14 @@ class Estimator:
         return out
 
     def now(self) -> dict[str, FloatArray | float]:
-        """State predicted to the newest IMU sample: ``t``, ``q_nb`` (4,), ``vel_n`` (3,), ``pos_n`` (3,)."""
-        kernels.now(self._S, self._prm, self._now)
+        """State predicted to the newest IMU sample: ``t``, ``q_nb`` (4,), ``vel_n`` (3,), ``pos_n`` (3,); NaN what it does not hold."""
+        self._kernels.now(self._S, self._prm, self._now)
         x = self._now.copy()
         return {"t": float(x[0]), "q_nb": x[1:5], "vel_n": x[5:8], "pos_n": x[8:11]}
 
     def finish(self) -> State:
         """Move the fusion horizon to the newest IMU sample: the end of a flight."""
-        kernels.flush(self._S, self._prm, _NO_ROWS, _NO_ROWS, self._aids, _NO_ROWS, self._stage)
+        self._kernels.flush(self._S, self._prm, _NO_ROWS, _NO_ROWS, self._aids, _NO_ROWS, self._stage)
         return self._view
 
     def records(self) -> NDArray[np.void]:

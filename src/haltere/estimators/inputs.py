@@ -27,6 +27,7 @@ from haltere.aids.record import (
 )
 from haltere.core.earth import pressure_altitude
 from haltere.errors import UsageError
+from haltere.estimators.air import air_from_vanes, given_wind, steady_wind
 from haltere.flight import config as configuration
 from haltere.flight.config import KEYS, Config
 from haltere.flight.corrections import mounted
@@ -129,6 +130,11 @@ def _decided(checked: Checked, values: Mapping[str, Any]) -> dict[str, Any]:
     fly = rotors is not None and rotor_count(rotors) >= 3
     tube = airdata is not None and bool(np.isfinite(airdata.get("airspeed")).any())
     vanes = airdata is not None and bool(np.isfinite(airdata.get("aoa") + airdata.get("sideslip")).any())
+    if values["wind_attitude.filter"] == "quaternion":
+        if values["wind_attitude.air"] != "auto":
+            return {}
+        # airspeed without vanes is taken too, where there is nothing else: it says what it lacks
+        return {"wind_attitude.air": "vanes" if tube and vanes else "drag" if fly else "vanes" if tube else "off"}
     found = {"aid.drag": fly, "aid.airdata": tube, "aid.vanes": vanes, "aid.no_sideslip": tube and not (vanes or fly)}
     return {key: "on" if there else "off" for key, there in found.items() if values[key] == "auto"}
 
@@ -158,7 +164,7 @@ def parameters(config: Config) -> NDArray[np.void]:
     for name in PARAMETERS.names or ():
         if name in ("horizon", "covariance_interval", "imu_mean", "diagnosis_threshold"):
             continue
-        head = "two_stage" if name.startswith("two_stage_") else name.partition("_")[0]
+        head = next((h for h in ("two_stage", "wind_attitude") if name.startswith(f"{h}_")), name.partition("_")[0])
         record[name] = config.number(f"{head}.{name[len(head) + 1 :]}")
     record["imu_mean"] = config.number("imu.kind")
     record["horizon"] = horizon(config)
@@ -241,6 +247,38 @@ def _of_the_air(checked: Checked, config: Config) -> list[Part]:
     return parts
 
 
+def _wind_triangle(checked: Checked, config: Config) -> list[Part]:
+    """What the published filter of `wind-attitude` hears of the air: air velocity, wind, rotor speeds; what is missing is told."""
+    parts: list[Part] = []
+    told, left_out = checked.warnings, checked.discarded
+    airdata, rotors = checked.streams.get("airdata"), checked.streams.get("rotors")
+    if airdata is not None and config["aid.airdata"] == "on" and config["wind_attitude.air"] == "vanes":
+        air = air_from_vanes(airdata, config)
+        parts.append((VANES, air.t, air.v_b, air.r))
+        told += air.warnings
+        for reason, n in air.left_out.items():
+            left_out.setdefault("airdata", {})[reason] = n
+    wind = given_wind(checked.streams.get("wind"), config) if config["aid.wind"] == "on" else None
+    if wind is not None:
+        parts.append((WIND, wind.t, wind.wind_n, np.repeat(wind.r[:, None], 3, axis=1)))
+    if config["wind_attitude.air"] == "drag" and rotors is not None:
+        speeds = [rotors[c] for c in rotors.names if c.startswith("speed_")]
+        if speeds:
+            total = np.asarray(np.sum(np.abs(speeds), axis=0))
+            there = np.asarray(np.isfinite(total))
+            nan = np.full((int(there.sum()), 3), np.nan)
+            parts.append((ROTORS, rotors.t[there], np.column_stack([total[there], nan[:, :2]]), nan))
+    if config["wind_attitude.air"] != "off":
+        lacks = [] if checked.streams.get("gnss") is not None and config["aid.gnss"] == "on" else ["velocity from GNSS"]
+        if wind is None and steady_wind(config.values) is None and config["wind_attitude.rows"] == "jacobian":
+            lacks.append("wind (keys told_wind.n and told_wind.e or told_wind.speed and told_wind.from, or a stream wind)")
+        if lacks:
+            told.append(f"wind triangle: no {' and no '.join(lacks)}; attitude is that of gravity and field alone")
+    if config["wind_attitude.angles"] == "arctan":
+        told.append("roll and yaw are those of the printed arc tangents (3): wrong by half a turn in half the circle; as-corrected is not")
+    return parts
+
+
 def measurements(flight: FlightLog, checked: Checked, config: Config) -> Measurements:
     """Measurements that the configuration lets in, in the order of their stamps (ties: the order of the sensor codes)."""
     parts: list[Part] = []
@@ -266,7 +304,7 @@ def measurements(flight: FlightLog, checked: Checked, config: Config) -> Measure
         current = power.get("current")
         value = np.column_stack([current, np.full((len(power), 2), np.nan)])
         parts.append((POWER, power.t, value, np.full_like(value, np.nan)))
-    parts += _of_the_air(checked, config)
+    parts += (_wind_triangle if config["wind_attitude.filter"] == "quaternion" else _of_the_air)(checked, config)
     if not parts:
         return Measurements(np.empty(0, np.int64), np.empty(0), np.empty((0, 3)), np.empty((0, 3)))
     kind = np.concatenate([np.full(len(t), k, np.int64) for k, t, _, _ in parts])

@@ -1,10 +1,16 @@
-"""Estimators by name: one line each."""
+"""Estimators by name: one line each, and the kernels that each is made of."""
 
 from __future__ import annotations
 
 from types import ModuleType
+from typing import Any
 
-from haltere.estimators import ahrs, navigator, two_stage
+from haltere.estimators import ahrs, navigator, quaternion_step, step, two_stage, wind_attitude
 
 #: Module of each estimator.
-SPECIFICATIONS: dict[str, ModuleType] = {m.NAME: m for m in (navigator, ahrs, two_stage)}
+SPECIFICATIONS: dict[str, ModuleType] = {m.NAME: m for m in (navigator, ahrs, two_stage, wind_attitude)}
+
+
+def kernels_of(S: Any) -> ModuleType:
+    """The compiled step that belongs to an array of states: they have the same faces."""
+    return quaternion_step if S["P"].shape[1] == 4 else step

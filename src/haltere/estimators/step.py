@@ -41,6 +41,7 @@ __all__ = [
     "NODE_STEPS",
     "SUB_STEP",
     "advance",
+    "begin_air",
     "bridge_push",
     "flush",
     "interval",
@@ -413,6 +414,14 @@ def step(S: Any, PRM: Any, t: float, gyro: Vec, accel: Vec, rows: Any, cov: Any,
     while behind(s, prm):
         advance(s, prm, rows, cov, aids, tape, stage)
     return status
+
+
+@entry
+def begin_air(S: Any, PRM: Any) -> None:
+    """Wind and coefficients of the air as configured, for a state that was not aligned."""
+    s = S[0]
+    if len(s.wind) > 0:
+        alignment.start_air(s, PRM[0], 15 + len(s.baro) + len(s.mag))
 
 
 @entry

@@ -24,6 +24,7 @@ PRESETS: dict[str, tuple[str, ...]] = {
     "navigator": ("default",),
     "ahrs": ("default",),
     "two-stage": ("default", "as-corrected", "as-printed"),
+    "wind-attitude": ("default", "as-corrected", "as-printed"),
 }
 ESTIMATORS = tuple(PRESETS)
 
@@ -116,10 +117,18 @@ KEYS: dict[str, Key] = {
         "m/s",
         "Fake velocity of ahrs, 1 sigma at 5 Hz: worth 2 m/s that last a second. Lower trusts gravity more, accelerations less.",
     ),
+    "told_wind.n": Key(math.nan, "m/s", "Wind taken for true, where it blows to, north. Default: not given.", low=-100.0, high=100.0),
+    "told_wind.e": Key(math.nan, "m/s", "The same, east.", low=-100.0, high=100.0),
+    "told_wind.d": Key(0.0, "m/s", "The same, down.", low=-50.0, high=50.0),
+    "told_wind.speed": Key(
+        math.nan, "m/s", "Instead of told_wind.n and told_wind.e, as a station gives it: its speed,", low=0.0, high=100.0
+    ),
+    "told_wind.from": Key(math.nan, "rad", "and where it comes from, clockwise from true north.", low=-6.2832, high=6.2832),
+    "told_wind.sd": _positive(1.0, "m/s", "1 sigma of each of its components, gusts included."),
     "noise.wind_mean": _positive(0.05, "m/s/sqrt(s)", "Walk of the mean wind, which gusts return to."),
-    "wind.gust": _positive(0.3, "m/s", "Gusts, 1 sigma an axis in calm air; vertical ones are half of it."),
-    "wind.turbulence": Key(0.2, "1", "Gusts more in proportion to the mean wind.", low=0.0, high=2.0),
-    "wind.gust_time": _positive(3.0, "s", "How long a gust lasts."),
+    "air.gust": _positive(0.3, "m/s", "Gusts, 1 sigma an axis in calm air; vertical ones are half of it."),
+    "air.turbulence": Key(0.15, "1", "Gusts more in proportion to the mean wind.", low=0.0, high=2.0),
+    "air.gust_time": _positive(3.0, "s", "How long a gust lasts."),
     "noise.air_walk": _positive(
         2e-3, "1/sqrt(s)", "Walk of what air data depend on: relative for drag and airspeed scale, in m/s^2 and rad for offsets."
     ),
@@ -128,7 +137,7 @@ KEYS: dict[str, Key] = {
     "noise.sideslip": _positive(2.0 * DEG, "rad", "Vane of the sideslip, 1 sigma, likewise."),
     "noise.airdata_time": Key(0.5, "s", "How long errors of air data last (gusts shorter than that, the tube's lag).", low=0.0),
     "noise.no_sideslip": _positive(6.0 * DEG, "rad", "Sideslip of an aeroplane without vanes, 1 sigma, likewise."),
-    "noise.drag": _positive(0.2, "m/s^2", "What the drag model misses, 1 sigma, alike in all samples of noise.drag_time."),
+    "noise.drag": _positive(0.15, "m/s^2", "What the drag model misses, 1 sigma, alike in all samples of noise.drag_time."),
     "noise.drag_time": Key(0.2, "s", "That correlation time.", low=0.0),
     "noise.given_wind": _positive(1.0, "m/s", "Wind told from outside, 1 sigma, where no sd is told with it."),
     "noise.attitude": _positive(1.0 * DEG, "rad", "Roll and pitch told from outside, 1 sigma."),
@@ -284,6 +293,35 @@ KEYS: dict[str, Key] = {
     "two_stage.height_sign": _switch(
         "minus", "Down position of a fix is minus the height above the origin; plus is a misprint of the source.", ("minus", "plus")
     ),
+    "wind_attitude.filter": _switch(
+        "error-state",
+        "The filter behind wind-attitude, as its preset says: the error-state filter of haltere with wind as a state, or the published one "
+        "of four states.",
+        ("error-state", "quaternion"),
+    ),
+    "wind_attitude.integrator": _switch(
+        "picard4",
+        "Step of the quaternion: Picard's approximations (published: the fourth), Runge-Kutta, or exact for a constant rate.",
+        ("picard1", "picard2", "picard3", "picard4", "rk4", "exp"),
+    ),
+    "wind_attitude.residual": _switch("nonlinear", "z - h(q), or Z - H X as (25) prints it.", ("nonlinear", "printed")),
+    "wind_attitude.rows": _switch("jacobian", "Rows 7 to 9 of H: of the wind triangle, or as (20) prints them.", ("jacobian", "printed")),
+    "wind_attitude.normalise": _switch(
+        "on", "Bring the quaternion back to length one after each step: its covariance too (on), or not (length).", ("off", "length", "on")
+    ),
+    "wind_attitude.angles": _switch(
+        "atan2", "Roll and yaw given out: over the whole circle, or by the arc tangents of (3).", ("atan2", "arctan")
+    ),
+    "wind_attitude.accel": _switch("on", "Take specific force for gravity."),
+    "wind_attitude.force": _positive(1.0, "m/s^2", "Only where its size differs from gravity by less than this."),
+    "wind_attitude.acceleration": _positive(1.5, "m/s^2", "And only where GNSS velocity, if any, shows an acceleration below this."),
+    "wind_attitude.gate": _positive(1e6, "sigma", "Innovation gate of gravity, joint over the components."),
+    "wind_attitude.air": _switch(
+        "auto",
+        "Where the velocity through the air is from: vanes (stream airdata), drag (specific force over drag.*), or what there is: vanes, "
+        "else drag where at least three rotors turn.",
+        ("off", "vanes", "drag", "auto"),
+    ),
     "diagnosis.inertial": _switch(
         "on", "Look for faults of gyro and accelerometer axes by their signature in the innovations, name them, and take their effect back."
     ),
@@ -334,6 +372,9 @@ GROUPS: dict[str, tuple[str, ...]] = {
 
 _DIAGNOSIS = tuple(key for key in KEYS if key.startswith("diagnosis."))
 _TWO_STAGE = tuple(key for key in KEYS if key.startswith("two_stage."))
+_WIND_ATTITUDE = tuple(key for key in KEYS if key.startswith("wind_attitude."))
+#: A wind taken for true, which only the published filter of wind-attitude needs.
+_GIVEN_WIND = tuple(f"told_wind.{key}" for key in ("n", "e", "d", "speed", "from", "sd"))
 #: What only an estimator with wind has.
 _AIR_TAILS = (
     "wind wind_mean air_walk airspeed aoa sideslip airdata_time no_sideslip drag drag_time given_wind air airdata vanes airspeed_scale vane"
@@ -341,7 +382,7 @@ _AIR_TAILS = (
 _AIR = tuple(
     key
     for key in KEYS
-    if not key.startswith("delay.") and (key.startswith(("air.", "drag.", "wind.")) or key.partition(".")[2] in _AIR_TAILS)
+    if not key.startswith("delay.") and (key.startswith(("air.", "drag.", "told_wind.")) or key.partition(".")[2] in _AIR_TAILS)
 )
 _NO_AIR: dict[str, Value] = {"aid.drag": "off", "aid.airdata": "off", "aid.vanes": "off", "aid.no_sideslip": "off", "aid.wind": "off"}
 #: What an estimator sets differently from the defaults above.
@@ -358,6 +399,7 @@ _OVERRIDES: dict[str, dict[str, Value]] = {
         "aid.motor_field": "off", "diagnosis.inertial": "off", "two_stage.radial": 0.05, "two_stage.memory": 10.0,
         **_NO_AIR,
     },
+    "wind-attitude": {"air.moves": "all", "aid.magnetometer": "3-axis", "diagnosis.inertial": "off"},
 }  # fmt: skip
 _NO_GATE = 1e6
 #: What a preset of an estimator sets differently from its `default`. The source has no innovation tests.
@@ -365,18 +407,34 @@ _PRESET_OVERRIDES: dict[tuple[str, str], dict[str, Value]] = {
     ("two-stage", "as-corrected"): {
         "two_stage.tolerance": 0.03, "two_stage.innovation": "off", "two_stage.radial": math.nan,
         "two_stage.memory": 0.0, "two_stage.haversine": "on",
-        "gate.gnss": _NO_GATE, "gate.magnetometer": _NO_GATE, "noise.field": 0.0, "noise.gyro_scale": 0.0,
+        "gate.gnss": _NO_GATE, "gate.magnetometer": _NO_GATE, "noise.field": 0.0, "noise.gyro_scale": 0.0, "noise.between": 0.0,
     },
 }  # fmt: skip
 _PRESET_OVERRIDES["two-stage", "as-printed"] = _PRESET_OVERRIDES["two-stage", "as-corrected"] | {
     "two_stage.index": "algebraic",
     "two_stage.height_sign": "plus",
 }
+_PRESET_OVERRIDES["wind-attitude", "as-corrected"] = {
+    "wind_attitude.filter": "quaternion", "aid.magnetometer": "3-axis", "gate.magnetometer": _NO_GATE, "gate.air": _NO_GATE,
+    "noise.field": 0.0, "aid.airdata": "on",
+}  # fmt: skip
+_PRESET_OVERRIDES["wind-attitude", "as-printed"] = _PRESET_OVERRIDES["wind-attitude", "as-corrected"] | {
+    "wind_attitude.residual": "printed", "wind_attitude.rows": "printed", "wind_attitude.normalise": "off",
+    "wind_attitude.angles": "arctan", "wind_attitude.force": _NO_GATE, "wind_attitude.acceleration": _NO_GATE,
+}  # fmt: skip
+#: Where the keys begin that the published filter of wind-attitude is told; noise and delays a flight may tell of any sensor.
+_QUATERNION = (
+    "noise.", "delay.", "gate.magnetometer", "gate.air", "aid.gnss", "aid.magnetometer", "aid.airdata", "aid.wind", "timeout.magnetometer",
+    "timeout.imu", "field.", "home.", "init.tilt_", "init.yaw_", "init.accel_bias", "rest.gyro", "rest.gravity", "imu.kind", "unit.",
+    "axes.", "magnetometer.offset_", "magnetometer.matrix_", "magnetometer.load", "air.density", "drag.", "wind_attitude.", *_GIVEN_WIND,
+)  # fmt: skip
 #: Keys that an estimator does not have: changing them would change nothing, or make it another one.
 _FIXED: dict[str, tuple[str, ...]] = {
-    "navigator": _TWO_STAGE,
-    "ahrs": (*_OVERRIDES["ahrs"], *_TWO_STAGE, *_AIR, *_DIAGNOSIS),
+    "navigator": (*_TWO_STAGE, *_WIND_ATTITUDE, *_GIVEN_WIND),
+    "ahrs": (*_OVERRIDES["ahrs"], *_TWO_STAGE, *_AIR, *_WIND_ATTITUDE, *_DIAGNOSIS),
+    "wind-attitude": (*_TWO_STAGE, *_DIAGNOSIS, "wind_attitude.filter"),
     "two-stage": (
+        *_WIND_ATTITUDE,
         *_AIR,
         "aid.barometer",
         "baro.offset",
@@ -396,11 +454,21 @@ _FIXED: dict[str, tuple[str, ...]] = {
         "robust.calibration",
     ),
 }
+#: Further ones by preset.
+_FIXED_PRESET: dict[tuple[str, str], tuple[str, ...]] = {
+    ("wind-attitude", "default"): (*_WIND_ATTITUDE, *_GIVEN_WIND),
+    **{("wind-attitude", preset): tuple(k for k in KEYS if not k.startswith(_QUATERNION)) for preset in ("as-corrected", "as-printed")},
+}
 #: Words of a switch that an estimator does not have.
 _LACKS: dict[str, dict[str, tuple[str, ...]]] = {
     "navigator": {"aid.magnetometer": ("orthonormal",)},
     "ahrs": {"aid.magnetometer": ("orthonormal",)},
     "two-stage": {"aid.magnetometer": ("heading", "3-axis")},
+    "wind-attitude": {"aid.magnetometer": ("orthonormal",)},
+}
+_LACKS_PRESET: dict[tuple[str, str], dict[str, tuple[str, ...]]] = {
+    ("wind-attitude", preset): {"aid.magnetometer": ("heading", "orthonormal"), "aid.airdata": ("auto",)}
+    for preset in ("as-corrected", "as-printed")
 }
 
 
@@ -491,14 +559,16 @@ def resolve(estimator: str = "navigator", preset: str = "default", overrides: Ma
         Unknown estimator, preset or key (with the nearest name), a value out of bounds, or a key the estimator lacks.
     """
     values = defaults(estimator, preset)
+    fixed = (*_FIXED[estimator], *_FIXED_PRESET.get((estimator, preset), ()))
+    lacks = _LACKS[estimator] | _LACKS_PRESET.get((estimator, preset), {})
     for key, value in (overrides or {}).items():
         for name in GROUPS.get(key, (key,)):
             checked = _check(name, value, where)
             same = checked == values[name] or (checked != checked and values[name] != values[name])
-            if name in _FIXED[estimator] and not same:
+            if name in fixed and not same:
                 raise UsageError(f"a key that {estimator} has", repr(name), where, f"{estimator} keeps it at {values[name]}")
-            if checked in _LACKS[estimator].get(name, ()):
-                left = [w for w in KEYS[name].words if w not in _LACKS[estimator][name]]
+            if checked in lacks.get(name, ()):
+                left = [w for w in KEYS[name].words if w not in lacks[name]]
                 raise UsageError(f"{name} of {estimator} to be {' or '.join(left)}", repr(checked), where)
             values[name] = checked
     if estimator == "two-stage" and not float(values["two_stage.k1"]) < float(values["two_stage.k2"]):

@@ -33,11 +33,18 @@ def _airdata(out: Any, stream: Stream) -> Stream:
     known = np.isfinite(stream.get("airspeed")) | np.isfinite(stream.get("aoa") + stream.get("sideslip"))
     stream = out.drop("airdata", stream, np.asarray(known), "not finite")
     airspeed = stream.get("airspeed")
-    stream = out.drop("airdata", stream, np.asarray(~((airspeed < 0.0) | (airspeed > AIRSPEED_MAX))), "airspeed impossible in m/s")
-    angles = np.column_stack([stream.get("aoa"), stream.get("sideslip")])
-    found = np.abs(angles[np.isfinite(angles)])
-    if len(found) and (large := float(np.percentile(found, 95))) > 1.6:
-        out.warnings.append(f"airdata: expected aoa and sideslip in rad, found 5 % of them above {large:.3g}; not used; are they in deg?")
+    stream = out.drop(
+        "airdata", stream, np.asarray(~((airspeed < -AIRSPEED_MAX) | (airspeed > AIRSPEED_MAX))), "airspeed impossible in m/s"
+    )
+    # a vehicle that flies backwards, or is blown there, has angles of attack up to a half turn; asin gives sideslip a quarter
+    for name, most in (("aoa", 3.2), ("sideslip", 1.6)):
+        found = np.abs(stream.get(name))
+        found = found[np.isfinite(found)]
+        if not len(found) or (large := float(np.percentile(found, 95))) < most:
+            continue
+        out.warnings.append(
+            f"airdata: expected {name} within {most:g} rad, found 5 % of them above {large:.3g}; angles not used; are they in deg?"
+        )
         out.discarded.setdefault("airdata", {})["aoa and sideslip impossible in rad"] = len(stream)
         return Stream({c: v for c, v in stream.columns.items() if c not in ("aoa", "sideslip")})
     return stream

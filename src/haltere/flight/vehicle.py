@@ -93,7 +93,7 @@ class Vehicle:
     Attributes
     ----------
     mass
-        kg.
+        kg; 1 in a file that holds only ``[lumped]`` and does not say.
     inertia
         Elements xx, yy, zz, xy, xz, yz of the inertia matrix about the centre of gravity [kg m^2], FRD.
     rotors
@@ -192,10 +192,12 @@ def parse_vehicle(text: str, where: str = "vehicle file") -> Vehicle:
         raise HaltereError("at least one of [[rotor]] and [lumped]", "neither", where)
     if rotors and len(rotors) < 3:
         raise HaltereError("at least 3 rotors", f"{len(rotors)}", where)
+    # constants of [lumped] are per mass and inertia: a file that holds only them may leave these away
+    alone = not rotors
     vehicle = Vehicle(
         str(document.get("name", "vehicle")),
-        _positive(document, "mass", where),
-        _vector(document, "inertia", 6, where),
+        _positive(document, "mass", where) if "mass" in document or not alone else 1.0,
+        _vector(document, "inertia", 6, where) if "inertia" in document or not alone else (1.0, 1.0, 1.0, 0.0, 0.0, 0.0),
         rotors,
         _vector(body, "drag", 3, f"{where}: [body]") if "drag" in body else (0.0, 0.0, 0.0),
         _positive(document, "density", where) if "density" in document else 1.225,

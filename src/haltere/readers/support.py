@@ -263,6 +263,14 @@ def _heading_or_course(out: _Judgement) -> None:
         out.lacks("heading: neither magnetometer nor GNSS velocity", "magnetometer")
 
 
+def _air(out: _Judgement) -> None:
+    """Not what it cannot do without: the wind triangle is one of three observations."""
+    if out.usable("airdata", "airspeed", "aoa", "sideslip"):
+        out.can.append("velocity through the air from airspeed and vanes")
+    else:
+        out.advise("for the wind triangle: an airdata stream with airspeed, aoa and sideslip; or drag.mu, with which drag stands in for it")
+
+
 def _rotors(out: _Judgement) -> None:
     """Not an ability that the estimator lacks: fault detection watches rotor speeds besides it."""
     rotors = out.flight.get("rotors")
@@ -301,4 +309,5 @@ ESTIMATORS: dict[str, tuple[Callable[[_Judgement], None], ...]] = {
     "navigator": (_attitude, _velocity_and_position, _height, _heading_or_course, _wind, _rotors),
     "ahrs": (_level, _heading),
     "two-stage": (_attitude, _velocity_and_position, _heading_or_course),
+    "wind-attitude": (_attitude, _velocity_and_position, _heading_or_course, _wind, _air),
 }

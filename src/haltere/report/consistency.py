@@ -21,7 +21,7 @@ __all__ = ["consistency_figures", "unmarked"]
 
 FloatArray = NDArray[np.float64]
 #: What the parts of a vector are called in the records of the filter.
-QUANTITIES = {"vel": "velocity", "pos": "position", "mag": "field", "altitude": "altitude", "heading": "heading"}
+QUANTITIES = {"vel": "velocity", "pos": "position", "mag": "field", "altitude": "altitude", "heading": "heading", "down": "gravity"}
 #: The same, and sensors, where there is little room.
 SHORT = {"vel": "vel.", "pos": "pos.", "altitude": "alt.", "mag": "field", "magnetometer": "mag.", "barometer": "baro."}
 #: How lines of one colour are told apart, in the order of their axes.

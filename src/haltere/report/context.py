@@ -25,6 +25,7 @@ Mask = NDArray[np.bool_]
 SENSORS = {
     "gnss": "GNSS",
     "magnetometer": "magnetometer",
+    "accelerometer": "gravity",
     "barometer": "barometer",
     "airdata": "air data",
     "drag": "drag",
@@ -51,7 +52,9 @@ COMPONENTS: dict[str, tuple[str, str, float, float]] = {
     **{f"drag_{a}": (f"drag {a}", "m/s²", 1.0, 1e-4) for a in "xy"},
     **{f"wind_{w[0]}": (f"wind {w}", "m/s", 1.0, 1e-3) for w in ("north", "east", "down")},
     **{f"attitude_{a}": (f"attitude {a}", "deg", 180.0 / math.pi, 1e-3) for a in "xyz"},
-    **{f"field_{a}": (f"unit field {a}", "1", 1.0, 1e-4) for a in ("east", "down", "north")},
+    **{f"field_{a}": (f"unit field {a}", "1", 1.0, 1e-4) for a in ("east", "down", "north", *"xyz")},
+    **{f"down_{a}": (f"gravity {a}", "1", 1.0, 1e-4) for a in "xyz"},
+    **{f"air_{a}": (f"air velocity {a}", "m/s", 1.0, 1e-3) for a in "xyz"},
 }
 
 

@@ -68,6 +68,7 @@ SENSOR_COLOURS = {
     "barometer": "barometer",
     "magnetometer": "magnetometer",
     "imu": "imu",
+    "accelerometer": "imu",
     "airdata": "air",
     "drag": "air",
     "wind": "air",

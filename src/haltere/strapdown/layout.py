@@ -267,7 +267,7 @@ PARAMETERS = np.dtype(
             "noise_gnss_velocity noise_gnss_position noise_gnss_altitude noise_gnss_velocity_min noise_gnss_position_min "
             "noise_barometer noise_magnetometer noise_field noise_field_time noise_mag_offset "
             "noise_zero_velocity noise_zero_rate noise_fake_position noise_fake_position_rest noise_fake_velocity "
-            "noise_wind_mean noise_air_walk wind_gust wind_turbulence wind_gust_time "
+            "noise_wind_mean noise_air_walk air_gust air_turbulence air_gust_time "
             "noise_airspeed noise_aoa noise_sideslip noise_no_sideslip noise_drag noise_given_wind "
             "noise_attitude noise_attitude_yaw noise_attitude_time noise_drag_time noise_airdata_time "
             "gate_gnss gate_barometer gate_magnetometer gate_zero_velocity gate_zero_rate gate_air gate_drag gate_attitude "
@@ -289,6 +289,8 @@ PARAMETERS = np.dtype(
             "two_stage_radial two_stage_memory "
             "two_stage_haversine two_stage_height_sign "
             "diagnosis_inertial diagnosis_gyro diagnosis_accel diagnosis_threshold "
+            "wind_attitude_integrator wind_attitude_residual wind_attitude_rows wind_attitude_normalise wind_attitude_angles "
+            "wind_attitude_accel wind_attitude_force wind_attitude_acceleration wind_attitude_gate wind_attitude_air "
             "imu_mean horizon covariance_interval"
         ).split()
     ],
