@@ -439,8 +439,9 @@ def test_every_colour_a_figure_names_is_there(text: str) -> None:
 
 
 def test_report_reads_no_kernels() -> None:
-    """Nor anything that could compute what it draws; the page on a calibration draws the room that made it."""
+    """Nor anything that could compute what it draws; the pages on a calibration and on a vehicle draw the rooms that made them."""
     besides = {"calibration.py": ("haltere.calibrate", "haltere.readers")}
+    besides |= {"identification.py": ("haltere.identify",), "vehicle_model.py": ("haltere.identify", "haltere.vehicle")}
     for path in Path(sys.modules["haltere.report"].__path__[0]).glob("*.py"):
         for name in re.findall(r"^\s*(?:from|import) (haltere\.[a-z]+)", path.read_text(encoding="utf-8"), re.MULTILINE):
             assert name in ("haltere.flight", "haltere.metrics", "haltere.report", *besides.get(path.name, ())), f"{path.name}: {name}"

@@ -138,7 +138,7 @@ class Filter:
         d, i = keys["field.declination"], keys["field.dip"]
         self.h = np.array([np.cos(i) * np.cos(d), np.cos(i) * np.sin(d), np.sin(i)])
         self.velocity = (-1e9, np.zeros(3), np.zeros(3), np.zeros(3))
-        self.wind, self.wind_r = np.array([keys["wind.n"], keys["wind.e"], keys["wind.d"]]), keys["wind.sd"] ** 2
+        self.wind, self.wind_r = np.array([keys["told_wind.n"], keys["told_wind.e"], keys["told_wind.d"]]), keys["told_wind.sd"] ** 2
         self.records: list[tuple[float, str, Array, Array]] = []
 
     def normalise(self) -> None:
