@@ -12,12 +12,12 @@ from typing import Any
 
 from haltere.errors import HaltereError, UsageError
 from haltere.flight import axes
-from haltere.flight.units import UNITS, unit_word
+from haltere.flight.key import Key, Value, axes_key, delay, positive, switch, unit_key
+from haltere.flight.units import unit_word
 
-__all__ = ["ESTIMATORS", "KEYS", "PRESETS", "Config", "Key", "defaults", "load", "parse_assignment", "resolve"]
+__all__ = ["ESTIMATORS", "KEYS", "PRESETS", "Config", "Key", "Value", "defaults", "load", "parse_assignment", "resolve"]
 
 DEG = math.pi / 180.0
-Value = float | str | bool
 
 #: Estimators and the presets each has.
 PRESETS: dict[str, tuple[str, ...]] = {
@@ -29,52 +29,6 @@ PRESETS: dict[str, tuple[str, ...]] = {
 ESTIMATORS = tuple(PRESETS)
 
 
-@dataclass(frozen=True)
-class Key:
-    """One configuration key.
-
-    Attributes
-    ----------
-    default
-        Value where nothing else is said.
-    unit
-        SI unit, or the words it may be.
-    doc
-        What it is, and what raising or lowering it does.
-    words
-        Allowed words of a switch, in the order of their codes 0, 1, 2.
-    low, high
-        Bounds of a number, both allowed.
-    """
-
-    default: Value
-    unit: str
-    doc: str
-    words: tuple[str, ...] = ()
-    low: float = -math.inf
-    high: float = math.inf
-
-
-def _positive(default: float, unit: str, doc: str) -> Key:
-    return Key(default, unit, doc, low=1e-12)
-
-
-def _switch(default: str, doc: str, words: tuple[str, ...] = ("off", "on")) -> Key:
-    return Key(default, " or ".join(words), doc, words=words)
-
-
-def _delay(doc: str) -> Key:
-    return Key(0.0, "s", doc, low=0.0, high=2.0)
-
-
-def _unit(unit: str, doc: str) -> Key:
-    return Key(unit, ", ".join(UNITS[unit]), doc, words=tuple(UNITS[unit]))
-
-
-def _axes(doc: str) -> Key:
-    return Key(axes.WORDS[0], "one each of F or B, R or L, D or U", doc, words=axes.WORDS)
-
-
 _CALIBRATION = (
     "m = A (m_raw - b - k load), in the sensor's axes, after unit and axes were put right. m_raw is the field before the autopilot's own "
     "correction where the log tells it. `haltere calibrate magnetometer` finds it."
@@ -82,7 +36,7 @@ _CALIBRATION = (
 
 #: Every key (theory-amendments.md §8 unless said). NaN: from the data.
 KEYS: dict[str, Key] = {
-    "noise.gyro": _positive(1.5e-3, "rad/s/sqrt(Hz)", "Gyro white noise density, vibration included. Higher trusts the aids more."),
+    "noise.gyro": positive(1.5e-3, "rad/s/sqrt(Hz)", "Gyro white noise density, vibration included. Higher trusts the aids more."),
     "noise.gyro_scale": Key(
         0.005, "1", "Gyro error in proportion to the rate (scale, misalignment), 1 sigma, taken as noise that lasts a second.", low=0.0
     ),
@@ -92,27 +46,27 @@ KEYS: dict[str, Key] = {
         "Share of the change between two IMU samples that the mean between them may be off by, 1 sigma. It matters at low rates.",
         low=0.0,
     ),
-    "noise.accel": _positive(0.035, "m/s^2/sqrt(Hz)", "Accelerometer white noise density, vibration included."),
-    "noise.gyro_bias": _positive(1e-4, "rad/s/sqrt(s)", "Walk of the gyro bias."),
-    "noise.accel_bias": _positive(3e-4, "m/s^2/sqrt(s)", "Walk of the accelerometer bias."),
-    "noise.baro_bias": _positive(0.05, "m/sqrt(s)", "Walk of the barometer offset (weather, wind on the port)."),
-    "noise.gnss_velocity": _positive(0.5, "m/s", "GNSS velocity, 1 sigma, where the receiver gives no accuracy."),
-    "noise.gnss_position": _positive(1.0, "m", "GNSS horizontal position, 1 sigma, where the receiver gives no accuracy."),
-    "noise.gnss_altitude": _positive(2.0, "m", "GNSS altitude, 1 sigma, where the receiver gives no accuracy."),
-    "noise.gnss_velocity_min": _positive(0.1, "m/s", "Least velocity accuracy believed of a receiver: its errors last for many fixes."),
-    "noise.gnss_position_min": _positive(0.5, "m", "Least position accuracy believed of a receiver."),
-    "noise.barometer": _positive(1.0, "m", "Barometric altitude, 1 sigma."),
-    "noise.magnetometer": _positive(1.0, "uT", "Magnetometer, 1 sigma a sample, white."),
+    "noise.accel": positive(0.035, "m/s^2/sqrt(Hz)", "Accelerometer white noise density, vibration included."),
+    "noise.gyro_bias": positive(1e-4, "rad/s/sqrt(s)", "Walk of the gyro bias."),
+    "noise.accel_bias": positive(3e-4, "m/s^2/sqrt(s)", "Walk of the accelerometer bias."),
+    "noise.baro_bias": positive(0.05, "m/sqrt(s)", "Walk of the barometer offset (weather, wind on the port)."),
+    "noise.gnss_velocity": positive(0.5, "m/s", "GNSS velocity, 1 sigma, where the receiver gives no accuracy."),
+    "noise.gnss_position": positive(1.0, "m", "GNSS horizontal position, 1 sigma, where the receiver gives no accuracy."),
+    "noise.gnss_altitude": positive(2.0, "m", "GNSS altitude, 1 sigma, where the receiver gives no accuracy."),
+    "noise.gnss_velocity_min": positive(0.1, "m/s", "Least velocity accuracy believed of a receiver: its errors last for many fixes."),
+    "noise.gnss_position_min": positive(0.5, "m", "Least position accuracy believed of a receiver."),
+    "noise.barometer": positive(1.0, "m", "Barometric altitude, 1 sigma."),
+    "noise.magnetometer": positive(1.0, "uT", "Magnetometer, 1 sigma a sample, white."),
     "noise.field": Key(
         2.5, "uT", "What surroundings and calibration add to the field, 1 sigma, alike in all samples of a correlation time.", low=0.0
     ),
-    "noise.field_time": _positive(2.0, "s", "That correlation time."),
-    "noise.mag_offset": _positive(0.02, "uT/sqrt(s)", "Walk of the magnetometer's offset, where it is estimated."),
-    "noise.zero_velocity": _positive(0.05, "m/s", "Zero velocity at rest, 1 sigma at 10 Hz."),
-    "noise.zero_rate": _positive(0.01, "rad/s", "Zero rate at rest, 1 sigma at 10 Hz."),
-    "noise.fake_position": _positive(10.0, "m", "Fake position in flight, 1 sigma at 5 Hz."),
-    "noise.fake_position_rest": _positive(0.5, "m", "Fake position at rest, 1 sigma at 5 Hz."),
-    "noise.fake_velocity": _positive(
+    "noise.field_time": positive(2.0, "s", "That correlation time."),
+    "noise.mag_offset": positive(0.02, "uT/sqrt(s)", "Walk of the magnetometer's offset, where it is estimated."),
+    "noise.zero_velocity": positive(0.05, "m/s", "Zero velocity at rest, 1 sigma at 10 Hz."),
+    "noise.zero_rate": positive(0.01, "rad/s", "Zero rate at rest, 1 sigma at 10 Hz."),
+    "noise.fake_position": positive(10.0, "m", "Fake position in flight, 1 sigma at 5 Hz."),
+    "noise.fake_position_rest": positive(0.5, "m", "Fake position at rest, 1 sigma at 5 Hz."),
+    "noise.fake_velocity": positive(
         6.0,
         "m/s",
         "Fake velocity of ahrs, 1 sigma at 5 Hz: worth 2 m/s that last a second. Lower trusts gravity more, accelerations less.",
@@ -124,110 +78,110 @@ KEYS: dict[str, Key] = {
         math.nan, "m/s", "Instead of told_wind.n and told_wind.e, as a station gives it: its speed,", low=0.0, high=100.0
     ),
     "told_wind.from": Key(math.nan, "rad", "and where it comes from, clockwise from true north.", low=-6.2832, high=6.2832),
-    "told_wind.sd": _positive(1.0, "m/s", "1 sigma of each of its components, gusts included."),
-    "noise.wind_mean": _positive(0.05, "m/s/sqrt(s)", "Walk of the mean wind, which gusts return to."),
-    "air.gust": _positive(0.3, "m/s", "Gusts, 1 sigma an axis in calm air; vertical ones are half of it."),
+    "told_wind.sd": positive(1.0, "m/s", "1 sigma of each of its components, gusts included."),
+    "noise.wind_mean": positive(0.05, "m/s/sqrt(s)", "Walk of the mean wind, which gusts return to."),
+    "air.gust": positive(0.3, "m/s", "Gusts, 1 sigma an axis in calm air; vertical ones are half of it."),
     "air.turbulence": Key(0.15, "1", "Gusts more in proportion to the mean wind.", low=0.0, high=2.0),
-    "air.gust_time": _positive(3.0, "s", "How long a gust lasts."),
-    "noise.air_walk": _positive(
+    "air.gust_time": positive(3.0, "s", "How long a gust lasts."),
+    "noise.air_walk": positive(
         2e-3, "1/sqrt(s)", "Walk of what air data depend on: relative for drag and airspeed scale, in m/s^2 and rad for offsets."
     ),
-    "noise.airspeed": _positive(1.0, "m/s", "Airspeed, 1 sigma, alike in all samples of noise.airdata_time."),
-    "noise.aoa": _positive(2.0 * DEG, "rad", "Vane of the angle of attack, 1 sigma, likewise."),
-    "noise.sideslip": _positive(2.0 * DEG, "rad", "Vane of the sideslip, 1 sigma, likewise."),
+    "noise.airspeed": positive(1.0, "m/s", "Airspeed, 1 sigma, alike in all samples of noise.airdata_time."),
+    "noise.aoa": positive(2.0 * DEG, "rad", "Vane of the angle of attack, 1 sigma, likewise."),
+    "noise.sideslip": positive(2.0 * DEG, "rad", "Vane of the sideslip, 1 sigma, likewise."),
     "noise.airdata_time": Key(0.5, "s", "How long errors of air data last (gusts shorter than that, the tube's lag).", low=0.0),
-    "noise.no_sideslip": _positive(6.0 * DEG, "rad", "Sideslip of an aeroplane without vanes, 1 sigma, likewise."),
-    "noise.drag": _positive(0.15, "m/s^2", "What the drag model misses, 1 sigma, alike in all samples of noise.drag_time."),
+    "noise.no_sideslip": positive(6.0 * DEG, "rad", "Sideslip of an aeroplane without vanes, 1 sigma, likewise."),
+    "noise.drag": positive(0.15, "m/s^2", "What the drag model misses, 1 sigma, alike in all samples of noise.drag_time."),
     "noise.drag_time": Key(0.2, "s", "That correlation time.", low=0.0),
-    "noise.given_wind": _positive(1.0, "m/s", "Wind told from outside, 1 sigma, where no sd is told with it."),
-    "noise.attitude": _positive(1.0 * DEG, "rad", "Roll and pitch told from outside, 1 sigma."),
-    "noise.attitude_yaw": _positive(2.0 * DEG, "rad", "Yaw told from outside, 1 sigma."),
+    "noise.given_wind": positive(1.0, "m/s", "Wind told from outside, 1 sigma, where no sd is told with it."),
+    "noise.attitude": positive(1.0 * DEG, "rad", "Roll and pitch told from outside, 1 sigma."),
+    "noise.attitude_yaw": positive(2.0 * DEG, "rad", "Yaw told from outside, 1 sigma."),
     "noise.attitude_time": Key(1.0, "s", "How long the errors of a told attitude last.", low=0.0),
-    "gate.air": _positive(5.0, "sigma", "Innovation gate of airspeed, vanes and told wind."),
-    "gate.drag": _positive(15.0, "sigma", "The same of drag: wide, since wind may well step."),
-    "gate.attitude": _positive(5.0, "sigma", "Innovation gate of a told attitude."),
-    "gate.gnss": _positive(5.0, "sigma", "Innovation gate of GNSS position and velocity, joint over the components."),
-    "gate.barometer": _positive(5.0, "sigma", "Innovation gate of the barometer."),
-    "gate.magnetometer": _positive(6.0, "sigma", "Innovation gate of the magnetometer."),
-    "gate.zero_velocity": _positive(5.0, "sigma", "Innovation gate of zero velocity."),
-    "gate.zero_rate": _positive(5.0, "sigma", "Innovation gate of zero rate."),
-    "delay.gnss_velocity": _delay("A velocity stamped t was valid at t - delay. delay.gnss sets velocity and position."),
-    "delay.gnss_position": _delay("The same for position."),
-    "delay.barometer": _delay("The same for the barometer."),
-    "delay.magnetometer": _delay("The same for the magnetometer."),
-    "delay.rotors": _delay("The same for rotor speeds."),
-    "delay.airdata": _delay("The same for airspeed and vanes."),
-    "delay.wind": _delay("The same for a told wind."),
-    "delay.attitude": _delay("The same for a told attitude."),
-    "aid.gnss": _switch("on", "Use GNSS position and velocity."),
-    "aid.barometer": _switch("on", "Use the barometer."),
-    "aid.magnetometer": _switch(
+    "gate.air": positive(5.0, "sigma", "Innovation gate of airspeed, vanes and told wind."),
+    "gate.drag": positive(15.0, "sigma", "The same of drag: wide, since wind may well step."),
+    "gate.attitude": positive(5.0, "sigma", "Innovation gate of a told attitude."),
+    "gate.gnss": positive(5.0, "sigma", "Innovation gate of GNSS position and velocity, joint over the components."),
+    "gate.barometer": positive(5.0, "sigma", "Innovation gate of the barometer."),
+    "gate.magnetometer": positive(6.0, "sigma", "Innovation gate of the magnetometer."),
+    "gate.zero_velocity": positive(5.0, "sigma", "Innovation gate of zero velocity."),
+    "gate.zero_rate": positive(5.0, "sigma", "Innovation gate of zero rate."),
+    "delay.gnss_velocity": delay("A velocity stamped t was valid at t - delay. delay.gnss sets velocity and position."),
+    "delay.gnss_position": delay("The same for position."),
+    "delay.barometer": delay("The same for the barometer."),
+    "delay.magnetometer": delay("The same for the magnetometer."),
+    "delay.rotors": delay("The same for rotor speeds."),
+    "delay.airdata": delay("The same for airspeed and vanes."),
+    "delay.wind": delay("The same for a told wind."),
+    "delay.attitude": delay("The same for a told attitude."),
+    "aid.gnss": switch("on", "Use GNSS position and velocity."),
+    "aid.barometer": switch("on", "Use the barometer."),
+    "aid.magnetometer": switch(
         "heading",
         "Use the magnetometer: as a heading that leaves tilt alone, as three axes, or (two-stage, which has no other) as the horizontal "
         "field orthonormal to the gravity of its first stage.",
         ("off", "heading", "3-axis", "orthonormal"),
     ),
-    "aid.zero_velocity": _switch("on", "Zero velocity at rest."),
-    "aid.zero_rate": _switch("on", "Zero rate at rest."),
-    "aid.fake_position": _switch("on", "Fake position while nothing else holds it."),
-    "aid.yaw_bank": _switch("on", "Set yaw from GNSS velocity where it is unknown, or contradicted by it."),
-    "aid.fake_velocity": _switch("off", "Fake zero velocity, always on in ahrs."),
-    "aid.drag": _switch(
+    "aid.zero_velocity": switch("on", "Zero velocity at rest."),
+    "aid.zero_rate": switch("on", "Zero rate at rest."),
+    "aid.fake_position": switch("on", "Fake position while nothing else holds it."),
+    "aid.yaw_bank": switch("on", "Set yaw from GNSS velocity where it is unknown, or contradicted by it."),
+    "aid.fake_velocity": switch("off", "Fake zero velocity, always on in ahrs."),
+    "aid.drag": switch(
         "auto",
         "Estimate the horizontal wind of a multirotor from its drag, and the drag with it; auto: where at least three rotors turn.",
         ("off", "on", "auto"),
     ),
-    "aid.airdata": _switch(
+    "aid.airdata": switch(
         "auto",
         "Estimate the wind from airspeed and vanes, and their scale and offsets with it; auto: where the log has them.",
         ("off", "on", "auto"),
     ),
-    "aid.vanes": _switch(
+    "aid.vanes": switch(
         "auto",
         "Use vanes of angle of attack and sideslip, and estimate the vertical wind too; auto: where the log has both.",
         ("off", "on", "auto"),
     ),
-    "aid.no_sideslip": _switch(
+    "aid.no_sideslip": switch(
         "auto", "Take an aeroplane to fly straight through the air; auto: with airspeed, without vanes and rotors.", ("off", "on", "auto")
     ),
-    "aid.wind": _switch("on", "Use the stream wind, told from outside, where wind is estimated."),
-    "aid.attitude": _switch("on", "Use the stream attitude, told from outside."),
-    "air.moves": _switch(
+    "aid.wind": switch("on", "Use the stream wind, told from outside, where wind is estimated."),
+    "aid.attitude": switch("on", "Use the stream attitude, told from outside."),
+    "air.moves": switch(
         "wind",
         "What measurements of the air may move while GNSS is heard: only the wind and their own coefficients, or the whole state.",
         ("wind", "all"),
     ),
-    "air.density": _positive(math.nan, "kg/m^3", "Air density at the origin. Default: standard atmosphere at its altitude."),
-    "air.airspeed_min": _positive(4.0, "m/s", "Airspeeds below this say nothing."),
-    "drag.mu": _positive(0.3, "1/s", "Rotor drag over mass and speed at hover, standard atmosphere at sea level: as begun with."),
-    "drag.mu_sd": _positive(0.35, "1", "Its relative 1 sigma, log-normal. `haltere identify --drag` finds both."),
-    "drag.c": _positive(0.008, "1/m", "Quadratic drag over mass, standard atmosphere at sea level: as begun with."),
-    "drag.c_sd": _positive(0.7, "1", "Its relative 1 sigma, log-normal."),
-    "drag.offset_sd": _positive(0.1, "m/s^2", "1 sigma of what the thrust's axis is askew to the accelerometer's: 0.1 is 0.6 deg."),
-    "timeout.air": _positive(10.0, "s", "The same for measurements of the air."),
-    "timeout.drag": _positive(2.0, "s", "The same for drag."),
-    "timeout.attitude": _positive(10.0, "s", "The same for a told attitude."),
-    "timeout.gnss": _positive(7.0, "s", "After this long without a fix that passes, GNSS is let in again by force, at the gate's edge."),
-    "timeout.barometer": _positive(7.0, "s", "The same for the barometer."),
-    "timeout.magnetometer": _positive(10.0, "s", "The same for the magnetometer."),
-    "timeout.imu": _positive(2.0, "s", "IMU gaps longer than this are not bridged: the filter aligns anew."),
+    "air.density": positive(math.nan, "kg/m^3", "Air density at the origin. Default: standard atmosphere at its altitude."),
+    "air.airspeed_min": positive(4.0, "m/s", "Airspeeds below this say nothing."),
+    "drag.mu": positive(0.3, "1/s", "Rotor drag over mass and speed at hover, standard atmosphere at sea level: as begun with."),
+    "drag.mu_sd": positive(0.35, "1", "Its relative 1 sigma, log-normal. `haltere identify --drag` finds both."),
+    "drag.c": positive(0.008, "1/m", "Quadratic drag over mass, standard atmosphere at sea level: as begun with."),
+    "drag.c_sd": positive(0.7, "1", "Its relative 1 sigma, log-normal."),
+    "drag.offset_sd": positive(0.1, "m/s^2", "1 sigma of what the thrust's axis is askew to the accelerometer's: 0.1 is 0.6 deg."),
+    "timeout.air": positive(10.0, "s", "The same for measurements of the air."),
+    "timeout.drag": positive(2.0, "s", "The same for drag."),
+    "timeout.attitude": positive(10.0, "s", "The same for a told attitude."),
+    "timeout.gnss": positive(7.0, "s", "After this long without a fix that passes, GNSS is let in again by force, at the gate's edge."),
+    "timeout.barometer": positive(7.0, "s", "The same for the barometer."),
+    "timeout.magnetometer": positive(10.0, "s", "The same for the magnetometer."),
+    "timeout.imu": positive(2.0, "s", "IMU gaps longer than this are not bridged: the filter aligns anew."),
     "arm.gnss_x": Key(0.0, "m", "GNSS antenna ahead of the IMU (FRD)."),
     "arm.gnss_y": Key(0.0, "m", "GNSS antenna right of the IMU."),
     "arm.gnss_z": Key(0.0, "m", "GNSS antenna below the IMU."),
-    "aid.compass_watch": _switch(
+    "aid.compass_watch": switch(
         "on", "Compare the compass with the gyro and with the field so far; hear it no more while it is disturbed."
     ),
-    "aid.motor_field": _switch("on", "Find the field of the motors' currents from the flight, and take it off the magnetometer."),
-    "delay.power": _delay("The same for the battery current."),
-    "robust.innovation": _positive(
+    "aid.motor_field": switch("on", "Find the field of the motors' currents from the flight, and take it off the magnetometer."),
+    "delay.power": delay("The same for the battery current."),
+    "robust.innovation": positive(
         2.5, "sigma", "From this heading innovation on the variance of a magnetometer sample is inflated (IGG-III), up to its gate."
     ),
-    "robust.strength": _positive(0.04, "1", "Change of the field's strength taken as 1 sigma: inflated from two on, refused from six on."),
-    "robust.dip": _positive(2.5 * DEG, "rad", "The same for its dip."),
-    "robust.heading": _positive(
+    "robust.strength": positive(0.04, "1", "Change of the field's strength taken as 1 sigma: inflated from two on, refused from six on."),
+    "robust.dip": positive(2.5 * DEG, "rad", "The same for its dip."),
+    "robust.heading": positive(
         2.0 * DEG, "rad", "Turn against the gyro that a compass is allowed without turning, beside its noise and half of noise.field."
     ),
-    "robust.calibration": _positive(
+    "robust.calibration": positive(
         0.12, "1", "Error of its calibration, as a fraction of the field, that may turn a compass when the vehicle turns."
     ),
     "field.declination": Key(
@@ -236,50 +190,50 @@ KEYS: dict[str, Key] = {
     "field.dip": Key(
         math.nan, "rad", "Dip, down positive. Default: World Magnetic Model at home, else from the first samples.", low=-1.5708, high=1.5708
     ),
-    "field.strength": _positive(math.nan, "uT", "Field strength. Default: World Magnetic Model at home, else from the first samples."),
-    "field.tolerance_strength": _positive(0.35, "1", "Refuse a sample whose strength is off by more than this fraction."),
-    "field.tolerance_dip": _positive(20.0 * DEG, "rad", "Refuse a sample whose dip is off by more than this."),
+    "field.strength": positive(math.nan, "uT", "Field strength. Default: World Magnetic Model at home, else from the first samples."),
+    "field.tolerance_strength": positive(0.35, "1", "Refuse a sample whose strength is off by more than this fraction."),
+    "field.tolerance_dip": positive(20.0 * DEG, "rad", "Refuse a sample whose dip is off by more than this."),
     "home.lat": Key(math.nan, "deg", "Origin latitude. Default: the log's home, else the first 3-D fix.", low=-90.0, high=90.0),
     "home.lon": Key(math.nan, "deg", "Origin longitude.", low=-360.0, high=360.0),
     "home.alt": Key(math.nan, "m", "Origin altitude above mean sea level.", low=-1e4, high=1e5),
-    "init.tilt_rest": _positive(3.0 * DEG, "rad", "1 sigma of roll and pitch aligned at rest, without the accelerometer bias."),
-    "init.tilt_motion": _positive(10.0 * DEG, "rad", "1 sigma of roll and pitch aligned in motion."),
-    "init.yaw_compass": _positive(10.0 * DEG, "rad", "1 sigma of yaw from a compass that passed its tests."),
-    "init.yaw_unknown": _positive(60.0 * DEG, "rad", "1 sigma of yaw without one."),
-    "init.gyro_bias_rest": _positive(0.05 * DEG, "rad/s", "1 sigma of the gyro bias measured at rest."),
-    "init.gyro_bias": _positive(0.01, "rad/s", "1 sigma of the gyro bias aligned in motion."),
-    "init.accel_bias": _positive(0.2, "m/s^2", "1 sigma of the accelerometer bias."),
-    "init.velocity": _positive(0.3, "m/s", "Least 1 sigma of velocity."),
-    "init.baro_bias": _positive(3.0, "m", "1 sigma of the barometer offset."),
-    "init.mag_offset": _positive(5.0, "uT", "1 sigma of the magnetometer's offset, where it is estimated."),
-    "init.wind": _positive(5.0, "m/s", "1 sigma of each component of the horizontal wind, which begins at none."),
-    "init.airspeed_scale": _positive(0.1, "1", "Relative 1 sigma of the airspeed's scale."),
-    "init.vane": _positive(3.0 * DEG, "rad", "1 sigma of a vane's offset."),
-    "rest.gyro": _positive(0.02, "rad/s", "At rest the rate's standard deviation over a second is below this."),
-    "rest.accel": _positive(0.3, "m/s^2", "At rest the standard deviation of |f| over a second is below this."),
-    "rest.gravity": _positive(0.5, "m/s^2", "At rest mean |f| differs from gravity by less than this."),
-    "two_stage.tolerance": _positive(
+    "init.tilt_rest": positive(3.0 * DEG, "rad", "1 sigma of roll and pitch aligned at rest, without the accelerometer bias."),
+    "init.tilt_motion": positive(10.0 * DEG, "rad", "1 sigma of roll and pitch aligned in motion."),
+    "init.yaw_compass": positive(10.0 * DEG, "rad", "1 sigma of yaw from a compass that passed its tests."),
+    "init.yaw_unknown": positive(60.0 * DEG, "rad", "1 sigma of yaw without one."),
+    "init.gyro_bias_rest": positive(0.05 * DEG, "rad/s", "1 sigma of the gyro bias measured at rest."),
+    "init.gyro_bias": positive(0.01, "rad/s", "1 sigma of the gyro bias aligned in motion."),
+    "init.accel_bias": positive(0.2, "m/s^2", "1 sigma of the accelerometer bias."),
+    "init.velocity": positive(0.3, "m/s", "Least 1 sigma of velocity."),
+    "init.baro_bias": positive(3.0, "m", "1 sigma of the barometer offset."),
+    "init.mag_offset": positive(5.0, "uT", "1 sigma of the magnetometer's offset, where it is estimated."),
+    "init.wind": positive(5.0, "m/s", "1 sigma of each component of the horizontal wind, which begins at none."),
+    "init.airspeed_scale": positive(0.1, "1", "Relative 1 sigma of the airspeed's scale."),
+    "init.vane": positive(3.0 * DEG, "rad", "1 sigma of a vane's offset."),
+    "rest.gyro": positive(0.02, "rad/s", "At rest the rate's standard deviation over a second is below this."),
+    "rest.accel": positive(0.3, "m/s^2", "At rest the standard deviation of |f| over a second is below this."),
+    "rest.gravity": positive(0.5, "m/s^2", "At rest mean |f| differs from gravity by less than this."),
+    "two_stage.tolerance": positive(
         math.nan,
         "1",
         "T_D: one unit of the anomaly index, in |F| (uT^2 where the index is algebraic). Default: the index's own 1 sigma, twice that of "
         "the field over its strength. Higher lets more disturbed field in.",
     ),
-    "two_stage.k1": _positive(2.0, "T_D", "Anomaly index from which the magnetometer's variance is inflated."),
-    "two_stage.k2": _positive(6.0, "T_D", "Anomaly index from which a magnetometer sample is dropped."),
-    "two_stage.robust": _switch(
+    "two_stage.k1": positive(2.0, "T_D", "Anomaly index from which the magnetometer's variance is inflated."),
+    "two_stage.k2": positive(6.0, "T_D", "Anomaly index from which a magnetometer sample is dropped."),
+    "two_stage.robust": switch(
         "igg3",
         "How the variance grows between k1 and k2; huber never drops, off takes every sample as it is.",
         ("off", "igg3", "huber", "step"),
     ),
-    "two_stage.index": _switch(
+    "two_stage.index": switch(
         "relative",
         "F of the anomaly index: |m|^2/|H|^2 - 1, or the algebraic |m|^2 - |H|^2 [uT^2] of the printed one.",
         ("relative", "algebraic"),
     ),
-    "two_stage.innovation": _switch(
+    "two_stage.innovation": switch(
         "on", "A second factor from sqrt(NIS): two_stage.robust from robust.innovation to gate.magnetometer, where it is dropped."
     ),
-    "two_stage.radial": _positive(
+    "two_stage.radial": positive(
         math.nan, "1", "Slack of the unit horizontal field along itself, which its noise does not move. Default: as much as across."
     ),
     "two_stage.memory": Key(
@@ -289,74 +243,72 @@ KEYS: dict[str, Key] = {
         low=0.0,
         high=1e4,
     ),
-    "two_stage.haversine": _switch("off", "North and east of a fix by the haversine on a sphere, as printed, instead of on WGS-84."),
-    "two_stage.height_sign": _switch(
+    "two_stage.haversine": switch("off", "North and east of a fix by the haversine on a sphere, as printed, instead of on WGS-84."),
+    "two_stage.height_sign": switch(
         "minus", "Down position of a fix is minus the height above the origin; plus is a misprint of the source.", ("minus", "plus")
     ),
-    "wind_attitude.filter": _switch(
+    "wind_attitude.filter": switch(
         "error-state",
         "The filter behind wind-attitude, as its preset says: the error-state filter of haltere with wind as a state, or the published one "
         "of four states.",
         ("error-state", "quaternion"),
     ),
-    "wind_attitude.integrator": _switch(
+    "wind_attitude.integrator": switch(
         "picard4",
         "Step of the quaternion: Picard's approximations (published: the fourth), Runge-Kutta, or exact for a constant rate.",
         ("picard1", "picard2", "picard3", "picard4", "rk4", "exp"),
     ),
-    "wind_attitude.residual": _switch("nonlinear", "z - h(q), or Z - H X as (25) prints it.", ("nonlinear", "printed")),
-    "wind_attitude.rows": _switch("jacobian", "Rows 7 to 9 of H: of the wind triangle, or as (20) prints them.", ("jacobian", "printed")),
-    "wind_attitude.normalise": _switch(
+    "wind_attitude.residual": switch("nonlinear", "z - h(q), or Z - H X as (25) prints it.", ("nonlinear", "printed")),
+    "wind_attitude.rows": switch("jacobian", "Rows 7 to 9 of H: of the wind triangle, or as (20) prints them.", ("jacobian", "printed")),
+    "wind_attitude.normalise": switch(
         "on", "Bring the quaternion back to length one after each step: its covariance too (on), or not (length).", ("off", "length", "on")
     ),
-    "wind_attitude.angles": _switch(
+    "wind_attitude.angles": switch(
         "atan2", "Roll and yaw given out: over the whole circle, or by the arc tangents of (3).", ("atan2", "arctan")
     ),
-    "wind_attitude.accel": _switch("on", "Take specific force for gravity."),
-    "wind_attitude.force": _positive(1.0, "m/s^2", "Only where its size differs from gravity by less than this."),
-    "wind_attitude.acceleration": _positive(1.5, "m/s^2", "And only where GNSS velocity, if any, shows an acceleration below this."),
-    "wind_attitude.gate": _positive(1e6, "sigma", "Innovation gate of gravity, joint over the components."),
-    "wind_attitude.air": _switch(
+    "wind_attitude.accel": switch("on", "Take specific force for gravity."),
+    "wind_attitude.force": positive(1.0, "m/s^2", "Only where its size differs from gravity by less than this."),
+    "wind_attitude.acceleration": positive(1.5, "m/s^2", "And only where GNSS velocity, if any, shows an acceleration below this."),
+    "wind_attitude.gate": positive(1e6, "sigma", "Innovation gate of gravity, joint over the components."),
+    "wind_attitude.air": switch(
         "auto",
         "Where the velocity through the air is from: vanes (stream airdata), drag (specific force over drag.*), or what there is: vanes, "
         "else drag where at least three rotors turn.",
         ("off", "vanes", "drag", "auto"),
     ),
-    "diagnosis.inertial": _switch(
+    "diagnosis.inertial": switch(
         "on", "Look for faults of gyro and accelerometer axes by their signature in the innovations, name them, and take their effect back."
     ),
-    "diagnosis.false_alarms": _positive(0.035, "1/h", "Wanted rate of false alarms; lower finds faults later."),
+    "diagnosis.false_alarms": positive(0.035, "1/h", "Wanted rate of false alarms; lower finds faults later."),
     "diagnosis.gyro": Key(0.3 * DEG, "rad/s", "Change of a gyro bias that is no fault.", low=0.0),
     "diagnosis.accel": Key(0.08, "m/s^2", "Change of an accelerometer bias that is no fault.", low=0.0),
-    "imu.kind": _switch("instant", "An IMU sample is the value at its time, or the mean since the sample before.", ("instant", "mean")),
+    "imu.kind": switch("instant", "An IMU sample is the value at its time, or the mean since the sample before.", ("instant", "mean")),
     "baro.temperature": Key(
         math.nan, "K", "Air temperature at the ground, scales pressure altitude. Default: standard atmosphere.", low=200.0, high=330.0
     ),
-    "baro.offset": _switch("on", "Estimate the barometer offset as a state."),
-    "magnetometer.refine": _switch(
-        "off", "Estimate the magnetometer's offset (hard iron) as slow states; tilt is left alone all the same."
-    ),
-    "unit.time": _unit("s", "What the log's time stamps are in, in every stream."),
-    "unit.gyro": _unit("rad/s", "What the log's angular rates are in."),
-    "unit.accel": _unit("m/s^2", "What the log's specific forces are in."),
-    "unit.magnetometer": _unit("uT", "What the log's magnetic field is in: G is gauss, mG milligauss, T tesla."),
-    "unit.pressure": _unit("Pa", "What the log's static pressure is in."),
-    "unit.gnss_position": _unit("deg", "What the log's latitude and longitude are in."),
-    "unit.gnss_altitude": _unit("m", "What the log's GNSS altitude is in."),
-    "unit.gnss_velocity": _unit("m/s", "What the log's GNSS velocity is in."),
-    "axes.gyro": _axes(
+    "baro.offset": switch("on", "Estimate the barometer offset as a state."),
+    "magnetometer.refine": switch("off", "Estimate the magnetometer's offset (hard iron) as slow states; tilt is left alone all the same."),
+    "unit.time": unit_key("s", "What the log's time stamps are in, in every stream."),
+    "unit.gyro": unit_key("rad/s", "What the log's angular rates are in."),
+    "unit.accel": unit_key("m/s^2", "What the log's specific forces are in."),
+    "unit.magnetometer": unit_key("uT", "What the log's magnetic field is in: G is gauss, mG milligauss, T tesla."),
+    "unit.pressure": unit_key("Pa", "What the log's static pressure is in."),
+    "unit.gnss_position": unit_key("deg", "What the log's latitude and longitude are in."),
+    "unit.gnss_altitude": unit_key("m", "What the log's GNSS altitude is in."),
+    "unit.gnss_velocity": unit_key("m/s", "What the log's GNSS velocity is in."),
+    "axes.gyro": axes_key(
         "Where the gyro's x, y and z point in the body: forward or back, right or left, down or up. `FLU` is forward, left, up; "
         "`FRU` is a mirrored triad, allowed too."
     ),
-    "axes.accel": _axes(
+    "axes.accel": axes_key(
         "The same for the accelerometer. `BLU`, all three turned over, is one that gives gravity instead of specific force."
     ),
-    "axes.magnetometer": _axes("The same for the magnetometer."),
+    "axes.magnetometer": axes_key("The same for the magnetometer."),
     "magnetometer.offset_x": Key(0.0, "uT", f"Offset b of the magnetometer: {_CALIBRATION}"),
     "magnetometer.offset_y": Key(0.0, "uT", "The same along y."),
     "magnetometer.offset_z": Key(0.0, "uT", "The same along z."),
     **{f"magnetometer.matrix_{r}{c}": Key(float(r == c), "1", f"Matrix A of the same, {r} from {c}.") for r in "xyz" for c in "xyz"},
-    "magnetometer.load": _switch(
+    "magnetometer.load": switch(
         "off",
         "What the magnetometer's offset follows: the battery's current, the mean rotor command, or the mean rotor speed.",
         ("off", "current", "throttle", "rotors"),
