@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from haltere import drive
 from haltere._jit import COMPILED
 from haltere.diagnosis import inertial, steps
-from haltere.drive import run
 from haltere.estimators.base import Estimator
 from haltere.estimators.inputs import alarm_level, parameters
 from haltere.filter import signatures
@@ -27,6 +27,11 @@ FloatArray = NDArray[np.float64]
 needs_inner = pytest.mark.skipif(COMPILED, reason="inner kernels are called from Python: HALTERE_JIT=0 or open")
 DEG = math.pi / 180.0
 WIND = {"n": 5.2, "e": 3.0, "gust": 1.2}
+
+
+def run(flight: FlightLog, **options: Any) -> Any:
+    """`haltere.run` with the diagnosis, which is off by default."""
+    return drive.run(flight, **{**options, "set": {"diagnosis.inertial": "on", **options.get("set", {})}})
 
 
 def column(fault: int, slot: int) -> int:
