@@ -17,14 +17,13 @@ from haltere.estimators.inputs import alarm_level, parameters
 from haltere.filter import signatures
 from haltere.filter.signatures import ACCEL, ACCEL_RAMP, GYRO, GYRO_RAMP, HEADING, N_FAULTS, POSITION, SLOTS, VELOCITY, YAW
 from haltere.filter.update import NONE
-from haltere.flight.config import resolve
+from haltere.flight.config import Config, resolve
 from haltere.flight.log import FlightLog
 from haltere.metrics.detection import detections
 from haltere.simulate import Scenario, demo_flight, inject, simulate
 from haltere.strapdown.layout import layout
 
 FloatArray = NDArray[np.float64]
-needs_inner = pytest.mark.skipif(COMPILED, reason="inner kernels are called from Python: HALTERE_JIT=0 or open")
 DEG = math.pi / 180.0
 WIND = {"n": 5.2, "e": 3.0, "gust": 1.2}
 
@@ -43,7 +42,7 @@ def column(fault: int, slot: int) -> int:
 
 def fly(flight: FlightLog, until: float, size: FloatArray, onset: float, options: Any) -> Estimator:
     """Online over the flight up to ``until``, with a constant added to gyro (3) and accelerometer (3) after the onset."""
-    est = Estimator("navigator", options)
+    est = Estimator("navigator", options if isinstance(options, Config) else {"diagnosis.inertial": "on", **options})
     imu, gnss, mag, baro = (flight[k] for k in ("imu", "gnss", "magnetometer", "barometer"))
     w, f = imu.vector("gyro"), imu.vector("accel")
     queue = sorted(
@@ -164,7 +163,6 @@ def transition(rng: np.random.Generator) -> tuple[Any, FloatArray]:
     return (tuple(map(tuple, D)), tuple(map(tuple, A)), tuple(map(tuple, B)), dt), F
 
 
-@needs_inner
 def test_the_bank_is_what_dense_matrices_make_of_it() -> None:
     rng = np.random.default_rng(3)
     S = np.zeros(1, layout(1, banks=1))
@@ -211,7 +209,6 @@ def test_the_bank_is_what_dense_matrices_make_of_it() -> None:
     assert b["den"] == pytest.approx(den, rel=1e-3, abs=1e-3)
 
 
-@needs_inner
 def test_a_lone_outlier_proves_nothing_and_what_stays_does() -> None:
     S = np.zeros(1, layout(1, banks=1))
     S = S if COMPILED else S.view(np.recarray)
@@ -236,7 +233,6 @@ def test_a_lone_outlier_proves_nothing_and_what_stays_does() -> None:
     assert b["num"][j] / b["den"][j] == pytest.approx(np.dot(weights, values) / sum(weights), rel=1e-4)
 
 
-@needs_inner
 def test_onsets_are_close_when_they_are_recent_and_reach_back() -> None:
     S = np.zeros(1, layout(1, banks=1))
     S = S if COMPILED else S.view(np.recarray)
