@@ -58,10 +58,10 @@ def whole_files(folder: Path, last: str, stale: Iterable[str] = ()) -> Iterator[
         # Inside a folder that is there, as it may be on a file system of its own; beside one that is not, to be renamed as a whole.
         work = folder / MARK if folder.is_dir() else folder.parent / beside
         work = work.with_name(f"{work.name}{secrets.token_hex(6)}")
-        work.mkdir()
     held = -1
     try:
         with _told(folder):
+            work.mkdir()  # an interruption may come right after it
             held = os.open(work, os.O_RDONLY)
             fcntl.flock(held, fcntl.LOCK_EX)
             yield work
@@ -69,9 +69,13 @@ def whole_files(folder: Path, last: str, stale: Iterable[str] = ()) -> Iterator[
                 _flush(file)
             _put(work, folder, last, stale)
     finally:
-        if held >= 0:
-            os.close(held)
-        shutil.rmtree(work, ignore_errors=True)
+        try:
+            if held >= 0:
+                os.close(held)
+            shutil.rmtree(work, ignore_errors=True)
+        except BaseException:  # interrupted while it was cleared away
+            shutil.rmtree(work, ignore_errors=True)
+            raise
 
 
 def _put(work: Path, folder: Path, last: str, stale: Iterable[str]) -> None:
