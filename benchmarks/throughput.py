@@ -67,7 +67,25 @@ def filter_run(estimator: str, flight: twin.Flight) -> Run:
         i = j = 0
         while i < n or S["imu_n"][0] > 0:
             i, j = kernels.run_chunk(
-                S, prm, flight.t, flight.gyro, flight.accel, i, n, kind, stamp, z, r, j, rows, cov, aids, np.empty((0, 0)), None
+                S,
+                prm,
+                flight.t,
+                flight.gyro,
+                flight.accel,
+                i,
+                n,
+                kind,
+                stamp,
+                z,
+                r,
+                j,
+                rows,
+                cov,
+                aids,
+                np.empty((0, 0)),
+                None,
+                np.empty(0),
+                np.empty((0, 0)),
             )
             S["n_aids"] = S["n_events"] = 0
         seconds = common.clock() - began

@@ -44,7 +44,7 @@ def test_the_twin_gives_the_same_numbers(keys: dict[str, float | str]) -> None:
     while i < n or S["imu_n"][0] > 0:
         i, j = kernels.run_chunk(
             S, prm, flight.t, flight.gyro, flight.accel, i, n, flight.kind, flight.stamp, flight.z, flight.r, j, rows, cov, aids,
-            np.empty((0, 0)), None,
+            np.empty((0, 0)), None, np.empty(0), np.empty((0, 0)),
         )  # fmt: skip
         S["n_aids"] = S["n_events"] = 0
     theirs = np.zeros((n, 37))

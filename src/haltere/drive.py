@@ -18,7 +18,9 @@ from haltere.diagnosis.findings import findings
 from haltere.errors import HaltereError, UsageError
 from haltere.estimators.base import InitialState, new_state
 from haltere.estimators.inputs import Measurements, configure, imu_arrays, measurements, parameters, request
+from haltere.estimators.lumped import Lumped
 from haltere.estimators.registry import SPECIFICATIONS, kernels_of
+from haltere.estimators.rotors import model_of, rotor_speeds
 from haltere.estimators.smoother import node_width, smoothed
 from haltere.estimators.step import COVARIANCE_ROWS
 from haltere.flight.config import Config
@@ -27,6 +29,7 @@ from haltere.flight.door import Checked, check, fit
 from haltere.flight.local import geodetic_from_local
 from haltere.flight.log import FlightLog
 from haltere.flight.solution import Solution
+from haltere.flight.vehicle import Vehicle
 from haltere.metrics.disturbance import describe, disturbances
 from haltere.metrics.summary import summarise
 from haltere.strapdown.layout import IMU_CAPACITY
@@ -47,7 +50,7 @@ def run(
     preset: str = "default",
     config: Config | Mapping[str, Any] | str | Path | None = None,
     set: Mapping[str, Any] | None = None,
-    vehicle: str | Path | None = None,
+    vehicle: str | Path | Vehicle | Lumped | None = None,
     smooth: bool = False,
     rate: float | None = None,
     initial: InitialState | None = None,
@@ -72,7 +75,7 @@ def run(
     set
         Single keys to change, over everything else.
     vehicle
-        Vehicle file. No estimator uses one yet.
+        Vehicle file with the force and moment model that ``haltere identify`` finds, or what was read from it.
     smooth
         Smooth the run too (fixed-interval): ``solution.smoothed``.
     rate
@@ -96,8 +99,7 @@ def run(
     UsageError
         Unknown estimator, preset or key, or something asked for that is not there.
     """
-    if vehicle is not None:
-        raise UsageError("no vehicle file", str(vehicle), "run", f"{estimator} does not use a vehicle model in this version")
+    model = None if vehicle is None else model_of(vehicle, estimator)
     if rate is not None and not (math.isfinite(rate) and rate > 0.0):
         raise UsageError("a positive number of rows a second", repr(rate), "--rate")
     began = time.perf_counter()
@@ -114,9 +116,12 @@ def run(
     specification = SPECIFICATIONS[estimator]
     t, gyro, accel = imu_arrays(blind, checked)
     offered = measurements(blind, checked, resolved)
+    if model is not None:
+        heard = rotor_speeds(checked.streams, model, t)
+        offered.rotor_t, offered.rotor_speed = heard.t, heard.speed
     prepared = time.perf_counter()
 
-    S, prm = new_state(resolved, initial), parameters(resolved)
+    S, prm = new_state(resolved, initial, model), parameters(resolved)
     cov = np.empty((COVARIANCE_ROWS, min(int((t[-1] - t[0]) / 0.1), len(t)) + 64))
     rows, aids_parts, events, nodes = _loop(S, prm, t, gyro, accel, offered, cov, progress, smooth)
     filtered = time.perf_counter()
@@ -146,7 +151,7 @@ def run(
         if lost:
             facts["warnings"].append(f"smoothed: {lost} times what came after could not be used; what is before was smoothed by itself")
     if scored and disturbances(solution.events):
-        describe(solution, shown, _unwatched(resolved, initial, t, gyro, accel, offered, solution.t))
+        describe(solution, shown, _unwatched(resolved, initial, model, t, gyro, accel, offered, solution.t))
     summarise(solution, shown, facts, scored)
     for name, stream in flight.streams.items():  # as read, before anything was left out
         solution.summary["streams"][name]["n"] = len(stream)
@@ -201,7 +206,27 @@ def _loop(
     stage = kernels.stage_of(S)
     i = j = 0
     while i < len(t) or S["imu_n"][0] > 0:
-        i, j = kernels.run_chunk(S, prm, t, gyro, accel, i, min(i + CHUNK, len(t)), m.kind, m.t, m.z, m.r, j, chunk, cov, aids, tape, stage)
+        i, j = kernels.run_chunk(
+            S,
+            prm,
+            t,
+            gyro,
+            accel,
+            i,
+            min(i + CHUNK, len(t)),
+            m.kind,
+            m.t,
+            m.z,
+            m.r,
+            j,
+            chunk,
+            cov,
+            aids,
+            tape,
+            stage,
+            m.rotor_t,
+            m.rotor_speed,
+        )
         drain()
         if progress is not None:
             progress(i / len(t))
@@ -210,11 +235,12 @@ def _loop(
 
 
 def _unwatched(
-    config: Config, initial: InitialState | None, t: FloatArray, gyro: FloatArray, accel: FloatArray, m: Measurements, at: FloatArray
-) -> FloatArray:
+    config: Config, initial: InitialState | None, model: Lumped | None, t: FloatArray, gyro: FloatArray, accel: FloatArray, m: Measurements,
+    at: FloatArray,
+) -> FloatArray:  # fmt: skip
     """Heading [rad] at the times ``at`` (k,) of the same filter hearing its compass to the end: what a disturbance would have done."""
     deaf = config.changed(aid__compass_watch="off")
-    rows = _loop(new_state(deaf, initial), parameters(deaf), t, gyro, accel, m, np.empty((COVARIANCE_ROWS, 0)), None, False)[0]
+    rows = _loop(new_state(deaf, initial, model), parameters(deaf), t, gyro, accel, m, np.empty((COVARIANCE_ROWS, 0)), None, False)[0]
     w, x, y, z = rows[1:5]
     yaw = np.unwrap(np.arctan2(2.0 * (x * y + w * z), w * w + x * x - y * y - z * z))
     return np.asarray(np.interp(at, rows[0], yaw)) if rows.shape[1] else np.full(len(at), np.nan)

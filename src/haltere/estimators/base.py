@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -30,7 +31,9 @@ from haltere.errors import HaltereError, UsageError
 from haltere.estimators import quaternion_step
 from haltere.estimators.air import steady_wind, vanes
 from haltere.estimators.inputs import altitude_of, parameters, rotation_vector
+from haltere.estimators.lumped import Lumped
 from haltere.estimators.registry import kernels_of
+from haltere.estimators.rotors import model_of
 from haltere.flight import config as configuration
 from haltere.flight.config import Config
 from haltere.flight.corrections import calibrated, calibration
@@ -135,10 +138,14 @@ class InitialState:
     baro_bias: float = 0.0
 
 
-def new_state(config: Config, initial: InitialState | None = None) -> NDArray[np.void]:
-    """State record, one element, that has seen nothing yet."""
+def new_state(config: Config, initial: InitialState | None = None, vehicle: Lumped | None = None) -> NDArray[np.void]:
+    """State record, one element, that has seen nothing yet; with the model of a vehicle where one is given."""
     quaternion = config["wind_attitude.filter"] == "quaternion"
-    record = as_records(np.zeros(1, quaternion_layout() if quaternion else layout(**_sizes(config))))
+    model = None if vehicle is None else vehicle.record()
+    kind = quaternion_layout() if quaternion else layout(**_sizes(config), model=None if model is None else model.dtype)
+    record = as_records(np.zeros(1, kind))
+    if model is not None:
+        record["model"][0, 0] = model[0]
     record["q"][0, 0] = 1.0
     home = (config.number("home.lat"), config.number("home.lon"), config.number("home.alt"))
     record["gravity"] = STANDARD_GRAVITY
@@ -251,6 +258,8 @@ class Estimator:
         the first fix (origin) and from the first magnetometer samples (field); declination is then 0.
     initial
         State to begin from instead of aligning.
+    vehicle
+        Vehicle file with ``[lumped]``, whose rotors are then heard one by one.
 
     Raises
     ------
@@ -265,8 +274,9 @@ class Estimator:
     """
 
     def __init__(
-        self, name: str = "navigator", config: Config | Mapping[str, Any] | None = None, initial: InitialState | None = None
-    ) -> None:
+        self, name: str = "navigator", config: Config | Mapping[str, Any] | None = None, initial: InitialState | None = None,
+        vehicle: str | Path | None = None,
+    ) -> None:  # fmt: skip
         if isinstance(config, Config):
             if config.estimator != name:
                 raise UsageError(f"a configuration of {name}", f"one of {config.estimator}", "Estimator")
@@ -279,7 +289,9 @@ class Estimator:
                 "online the load is not known: take its field off before offering, and set magnetometer.load=off",
             )  # fmt: skip
         self._calibration = calibration(self.config.values)
-        self._S = new_state(self.config, initial)
+        model = None if vehicle is None else model_of(vehicle, name)
+        self._rotors = 0 if model is None else len(model.yaw)
+        self._S = new_state(self.config, initial, model)
         self._kernels = kernels_of(self._S)
         self._stage = self._kernels.stage_of(self._S)
         self._prm = parameters(self.config)
@@ -419,8 +431,14 @@ class Estimator:
             if named == []:
                 raise UsageError("values of rotors by name (speed_0, speed_1, ...)", ", ".join(map(repr, values)), "Estimator.offer")
             speeds = named or _flat(values, "values of rotors")
-            total = sum(abs(_number(x, "a rotor's speed", "Estimator.offer")) for x in speeds)
-            return self._queue(ROTORS, t, (total, math.nan, math.nan), _NAN) if math.isfinite(total) else self._refuse(sensor, "not finite")
+            each = np.array([abs(_number(x, "a rotor's speed", "Estimator.offer")) for x in speeds])
+            total = float(each.sum())
+            if not math.isfinite(total):
+                return self._refuse(sensor, "not finite")
+            taken = self._queue(ROTORS, t, (total, math.nan, math.nan), _NAN)
+            if self._rotors and len(each) != self._rotors:
+                raise UsageError(f"speeds of {self._rotors} rotors, as the vehicle's model has", f"{len(each)}", "Estimator.offer")
+            return (self._rotors > 0 and self._kernels.offer_rotors(self._S, self._prm, t, each) == 1) or taken
         v = _in_order(sensor, values, {"airdata": 1, "wind": 2, "attitude": 4}[sensor])
         if sensor == "airdata" and self._kernels is quaternion_step:
             return self._offer_air_vector(t, v)

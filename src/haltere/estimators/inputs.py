@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from statistics import NormalDist
 from typing import Any
@@ -48,12 +48,17 @@ FAMILIES, JUDGEMENTS, COLOURED = 14.0, 10.0, 1.0
 
 @dataclass
 class Measurements:
-    """Measurements of all sensors in the order of their stamps: sensor code, stamp, values (m, 3), variances (m, 3)."""
+    """Measurements of all sensors in the order of their stamps: sensor code, stamp, values (m, 3), variances (m, 3).
+
+    ``rotor_t`` (k,) and ``rotor_speed`` (k, rotors) [rad/s] are those that a vehicle's model hears.
+    """
 
     kind: NDArray[np.int64]
     t: FloatArray
     z: FloatArray
     r: FloatArray
+    rotor_t: FloatArray = field(default_factory=lambda: np.empty(0))
+    rotor_speed: FloatArray = field(default_factory=lambda: np.empty((0, 0)))
 
 
 def request(

@@ -42,6 +42,8 @@ class Lumped:
         Rotor speeds were valid so long before their stamps [s].
     valid
         Range of what was flown: ``speed`` of a rotor [rad/s], ``airspeed`` [m/s], ``rate`` about each axis [rad/s].
+    motor
+        Where speeds are from commands: ``full`` [rad/s], ``linear``, ``tau`` [s], ``voltage`` [V], see `haltere.vehicle.motor`.
     """
 
     preset: str
@@ -57,6 +59,7 @@ class Lumped:
     window: tuple[float, float] = (0.1, 0.2)
     lag: float = 0.0
     valid: Mapping[str, Any] = field(default_factory=dict)
+    motor: Mapping[str, Any] | None = None
 
     @property
     def sd(self) -> FloatArray:
@@ -68,6 +71,8 @@ class Lumped:
         m = as_records(np.zeros(1, lumped_layout(len(self.yaw))))
         m["roll"], m["pitch"], m["yaw"], m["k"], m["aero"] = self.roll, self.pitch, self.yaw, self.k, np.array(AERO, dtype=np.float64)
         m["literal"] = int(self.preset == "literal")
+        m["density"], m["lag"] = self.density, self.lag
+        m["sd"], m["slow"], m["ar1"], m["window"] = self.residual_sd, self.residual_slow, self.residual_ar1, self.window
         return m
 
     def table(self) -> dict[str, Any]:
@@ -79,7 +84,7 @@ class Lumped:
             "k": {a: {NAMES[i][j]: float(self.k[i, j]) for j in used[i]} for i, a in enumerate(AXES)},
             "covariance": {a: self.covariance[i][np.ix_(used[i], used[i])].tolist() for i, a in enumerate(AXES)},
             "residual_sd": self.residual_sd.tolist(), "residual_ar1": self.residual_ar1.tolist(),
-            "residual_slow": self.residual_slow.tolist(), "valid": dict(self.valid),
+            "residual_slow": self.residual_slow.tolist(), "valid": dict(self.valid), **({"motor": dict(self.motor)} if self.motor else {}),
         }  # fmt: skip
 
 
@@ -119,9 +124,13 @@ def lumped_of(vehicle: Vehicle, where: str = "vehicle file") -> Lumped:
         raise HaltereError("finite constants", "others", where)
     sd, ar1, slow = (_vector(table, n, 6, where) for n in ("residual_sd", "residual_ar1", "residual_slow"))
     window = _vector(table, "window", 2, where)
+    motor = table.get("motor")
+    if motor is not None and not all(isinstance(motor.get(key), int | float) for key in ("full", "linear", "tau")):
+        raise HaltereError("numbers full, linear and tau", repr(motor)[:60], f"{where} motor")
     return Lumped(
         preset, weights[0], weights[1], weights[2], k, covariance, float(table.get("density", 1.225)), sd, ar1, slow,
         (float(window[0]), float(window[1])), float(table.get("lag", 0.0)), dict(table.get("valid", {})),
+        motor,
     )  # fmt: skip
 
 

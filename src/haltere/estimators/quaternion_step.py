@@ -281,9 +281,9 @@ def offer(S: Any, PRM: Any, kind: int, t: float, z: Vec, r: Vec) -> int:
 @entry
 def run_chunk(
     S: Any, PRM: Any, t: Any, gyro: Any, accel: Any, i: int, i_end: int, kinds: Any, stamps: Any, z: Any, r: Any, j: int, rows: Any,
-    cov: Any, aids: Any, tape: Any, stage: Any,
+    cov: Any, aids: Any, tape: Any, stage: Any, rotor_t: Any, rotor_speed: Any,
 ) -> tuple[int, int]:  # fmt: skip
-    """Do what `offer` and `step` do over IMU samples i ... i_end - 1; see `haltere.estimators.step.run_chunk`."""
+    """Do what `offer` and `step` do over IMU samples i ... i_end - 1; see `haltere.estimators.step.run_chunk`. No model hears rotors."""
     s, prm = S[0], PRM[0]
     while s.n_aids <= len(aids) - 2048 and s.n_events <= len(s.event) - 8 and s.n_rows <= rows.shape[0] - 2 * len(s.imu):
         if behind(s, prm) or (i == len(t) and s.imu_n > 0):

@@ -30,6 +30,7 @@ from haltere.core.rotation import Vec, cross, dcm, mat_vec, quat_from_rotvec, qu
 from haltere.diagnosis import inertial, steps
 from haltere.estimators import alignment, yaw_bank
 from haltere.filter.queue import pop_imu, push, push_imu
+from haltere.filter.rotors import push_rotors, rotors_at
 from haltere.strapdown.optional import get_optional
 from haltere.strapdown.propagate import predict, unseen
 
@@ -47,6 +48,7 @@ __all__ = [
     "interval",
     "now",
     "offer",
+    "offer_rotors",
     "row_width",
     "run_chunk",
     "stage_of",
@@ -279,6 +281,8 @@ def advance(s: Any, prm: Any, rows: Any, cov: Any, aids: Any, tape: Any, stage: 
     t = m.t
     w1, f1 = (m.w[0], m.w[1], m.w[2]), (m.f[0], m.f[1], m.f[2])
     pop_imu(s)
+    if len(s.model) > 0:
+        rotors_at(s, t)
     w0, f0 = (s.w_raw[0], s.w_raw[1], s.w_raw[2]), (s.f_raw[0], s.f_raw[1], s.f_raw[2])
     s.w_raw[0], s.w_raw[1], s.w_raw[2] = w1
     s.f_raw[0], s.f_raw[1], s.f_raw[2] = f1
@@ -460,6 +464,20 @@ def offer(S: Any, PRM: Any, kind: int, t: float, z: Vec, r: Vec) -> int:
     return push(s, kind, t - delay, z, r)
 
 
+@jit
+def hear_rotors(s: Any, prm: Any, t: float, speeds: Any) -> int:
+    """Queue the speeds of all rotors by the time they were valid, where there is a vehicle's model to hear them."""
+    if len(s.model) == 0:
+        return 2
+    return push_rotors(s, t - prm.delay_rotors - s.model[0].lag, speeds)
+
+
+@entry
+def offer_rotors(S: Any, PRM: Any, t: float, speeds: Any) -> int:
+    """Queue the speeds (n,) [rad/s] of all rotors stamped t; 1 queued, 0 refused and counted, 2 no model hears them."""
+    return hear_rotors(S[0], PRM[0], t, speeds)
+
+
 @entry
 def run_chunk(
     S: Any,
@@ -479,6 +497,8 @@ def run_chunk(
     aids: Any,
     tape: Any,
     stage: Any,
+    rotor_t: Any,
+    rotor_speed: Any,
 ) -> tuple[int, int]:
     """Do what `offer` and `step` do, over IMU samples i ... i_end - 1 and the measurements stamped at or before them.
 
@@ -493,6 +513,8 @@ def run_chunk(
         Measurements in order of their stamps: sensor codes (m,), stamps (m,), values and variances (m, 3).
     j
         Next measurement.
+    rotor_t, rotor_speed
+        Stamps (k,) and speeds (k, rotors) for a vehicle's model; how many were taken is counted in the state.
 
     Returns
     -------
@@ -513,6 +535,9 @@ def run_chunk(
             while j < len(stamps) and stamps[j] <= t[i]:
                 offer(S, PRM, kinds[j], stamps[j], (z[j, 0], z[j, 1], z[j, 2]), (r[j, 0], r[j, 1], r[j, 2]))
                 j += 1
+            while s.n_rotors < len(rotor_t) and rotor_t[s.n_rotors] <= t[i]:
+                hear_rotors(s, prm, rotor_t[s.n_rotors], rotor_speed[s.n_rotors])
+                s.n_rotors += 1
             take(s, t[i], (gyro[i, 0], gyro[i, 1], gyro[i, 2]), (accel[i, 0], accel[i, 1], accel[i, 2]))
             i += 1
         else:

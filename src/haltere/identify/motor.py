@@ -7,10 +7,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import minimize
-from scipy.signal import lfilter
 
 from haltere.errors import HaltereError
 from haltere.identify.prepare import Motion
+from haltere.vehicle.motor import commanded, driven
 
 __all__ = ["FULL", "Motor", "commands_of", "fit_motor", "modelled"]
 
@@ -52,20 +52,15 @@ def commands_of(m: Motion) -> tuple[FloatArray, FloatArray, float]:
     HaltereError
         The log has neither rotor speeds nor commands of at least three motors.
     """
-    for name in ("rotors", "actuators"):
-        stream = m.flight.get(name)
-        columns = [] if stream is None else [c for c in stream.names if c.startswith("command_")]
-        if stream is None or len(columns) < 3:
-            continue
-        values = np.column_stack([stream[c] for c in sorted(columns, key=lambda c: int(c[8:]))])
-        values = values[:, np.isfinite(values).any(axis=0) & (np.nanstd(values, axis=0) > 1e-3)]
-        good = np.isfinite(values).all(axis=1) & np.isfinite(stream.t)
-        t, values = stream.t[good], values[good]
-        if values.shape[1] >= 3 and len(t) > 50:
-            return t, np.clip(values, 0.0, 1.0), 1.0 / float(np.median(np.diff(t)))
-    raise HaltereError(
-        "rotor speeds, or commands of at least 3 motors", "neither", m.name, "log ESC telemetry; a motor model from commands is less sure"
-    )
+    t, values = commanded(m.flight.streams)
+    if not len(t):
+        raise HaltereError(
+            "rotor speeds, or commands of at least 3 motors",
+            "neither",
+            m.name,
+            "log ESC telemetry; a motor model from commands is less sure",
+        )
+    return t, values, 1.0 / float(np.median(np.diff(t)))
 
 
 def _voltage(m: Motion) -> tuple[FloatArray, float]:
@@ -84,10 +79,7 @@ def modelled(m: Motion, a: float, tau: float) -> FloatArray:
     """Speeds at the IMU's samples (n, r) [rad/s, a full command counted as `FULL`]."""
     t, u, _ = commands_of(m)
     ratio, _ = _voltage(m)
-    held = u[np.clip(np.searchsorted(t, m.t, side="right") - 1, 0, len(t) - 1)]  # a command holds until the next
-    wanted = FULL * np.sqrt(a * held + (1.0 - a) * held * held) * ratio[:, None]
-    keep = float(np.exp(-float(np.median(np.diff(m.t))) / tau))
-    return np.asarray(lfilter([1.0 - keep], [1.0, -keep], wanted, axis=0, zi=(keep * wanted[:1]))[0])
+    return driven(m.t, t, u, ratio, a, tau, FULL)
 
 
 def fit_motor(motions: list[Motion]) -> Motor:

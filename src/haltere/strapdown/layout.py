@@ -28,6 +28,7 @@ __all__ = [
     "PARAMETERS",
     "POS",
     "REST",
+    "ROTOR_CAPACITY",
     "STAGE",
     "THETA",
     "VEL",
@@ -44,6 +45,8 @@ CORE = 15
 #: IMU samples that wait for the fusion horizon, and measurements a sensor.
 IMU_CAPACITY = 512
 MEASUREMENT_CAPACITY = 128
+#: Samples of rotor speeds that wait, where a vehicle's model hears them.
+ROTOR_CAPACITY = 512
 EVENT_CAPACITY = 32
 #: Sensors whose measurements are queued.
 N_QUEUES = 10
@@ -299,7 +302,10 @@ PARAMETERS = np.dtype(
 
 
 @cache
-def layout(baro: int = 0, mag: int = 0, stages: int = 0, wind: int = 0, drag: int = 0, vane: int = 0, banks: int = 0) -> np.dtype[np.void]:
+def layout(
+    baro: int = 0, mag: int = 0, stages: int = 0, wind: int = 0, drag: int = 0, vane: int = 0, banks: int = 0,
+    model: np.dtype[np.void] | None = None,
+) -> np.dtype[np.void]:  # fmt: skip
     """State record type.
 
     Parameters
@@ -318,6 +324,8 @@ def layout(baro: int = 0, mag: int = 0, stages: int = 0, wind: int = 0, drag: in
         1 with the scale of the airspeed as a state, 3 with the offsets of both vanes too, else 0.
     banks
         1 with the memory of diagnosis, else 0.
+    model
+        Record type of a vehicle's model, see `haltere.vehicle.regressors.lumped_layout`; None without one.
 
     Returns
     -------
@@ -386,9 +394,27 @@ def layout(baro: int = 0, mag: int = 0, stages: int = 0, wind: int = 0, drag: in
             ("imu", IMU_SAMPLE, (IMU_CAPACITY,)),
             ("a", STAGE, (stages,)),
             ("bank", bank(n), (banks,)),
+            *_of_rotors(model),
             ("ring_head", "i8", N_QUEUES),
             ("ring_n", "i8", N_QUEUES),
             ("ring", MEASUREMENT, (N_QUEUES, MEASUREMENT_CAPACITY)),
         ],
         align=True,
     )
+
+
+def _of_rotors(model: np.dtype[np.void] | None) -> list[tuple[object, ...]]:
+    """Fields of a vehicle's model, of speeds that wait, and of the speeds at the state's time."""
+    n = 0 if model is None else model["yaw"].shape[0]
+    kind = _record(("k", "f8")) if model is None else np.dtype((np.record, model))
+    return [
+        ("model", kind, (1 if n else 0,)),
+        ("speed", "f8", (n,)),  # [rad/s], and their rates of change [rad/s^2]
+        ("spin_up", "f8", (n,)),
+        ("rotor_known", "i8"),
+        ("rotor_head", "i8"),
+        ("rotor_n", "i8"),
+        ("n_rotors", "i8"),  # samples of a log taken so far
+        ("n_rotor_bad", "i8"),
+        ("rotor", _record(("t", "f8"), ("o", "f8", (n,))), (ROTOR_CAPACITY if n else 0,)),
+    ]
