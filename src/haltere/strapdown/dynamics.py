@@ -178,7 +178,7 @@ def left(P: Any, n: int, T: Transition) -> None:
 def carry(s: Any, T: Transition) -> None:
     """Covariance ``s.P`` (25, 25) over one interval, A P Aᵀ; no noise is added."""
     P = s.P
-    for half in range(2):
+    for _half in range(2):
         left(P, 25, T)
         for i in range(25):
             for j in range(i):
