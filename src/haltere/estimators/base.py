@@ -142,7 +142,7 @@ def new_state(config: Config, initial: InitialState | None = None, vehicle: Lump
     """State record, one element, that has seen nothing yet; with the model of a vehicle where one is given."""
     quaternion = config["wind_attitude.filter"] == "quaternion"
     model = None if vehicle is None else vehicle.record()
-    kind = quaternion_layout() if quaternion else layout(**_sizes(config), model=None if model is None else model.dtype)
+    kind = quaternion_layout() if quaternion else layout(**_sizes(config), rotors=0 if vehicle is None else len(vehicle.yaw))
     record = as_records(np.zeros(1, kind))
     if model is not None:
         record["model"][0, 0] = model[0]

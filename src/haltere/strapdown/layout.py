@@ -12,6 +12,7 @@ from functools import cache
 import numpy as np
 
 from haltere._jit import constant
+from haltere.core.lumped import lumped_layout
 from haltere.strapdown.bank import bank
 
 __all__ = [
@@ -304,7 +305,7 @@ PARAMETERS = np.dtype(
 @cache
 def layout(
     baro: int = 0, mag: int = 0, stages: int = 0, wind: int = 0, drag: int = 0, vane: int = 0, banks: int = 0,
-    model: np.dtype[np.void] | None = None,
+    rotors: int = 0,
 ) -> np.dtype[np.void]:  # fmt: skip
     """State record type.
 
@@ -324,8 +325,8 @@ def layout(
         1 with the scale of the airspeed as a state, 3 with the offsets of both vanes too, else 0.
     banks
         1 with the memory of diagnosis, else 0.
-    model
-        Record type of a vehicle's model, see `haltere.vehicle.regressors.lumped_layout`; None without one.
+    rotors
+        Number of rotors of the vehicle's model, 0 without one.
 
     Returns
     -------
@@ -394,7 +395,7 @@ def layout(
             ("imu", IMU_SAMPLE, (IMU_CAPACITY,)),
             ("a", STAGE, (stages,)),
             ("bank", bank(n), (banks,)),
-            *_of_rotors(model),
+            *_of_rotors(rotors),
             ("ring_head", "i8", N_QUEUES),
             ("ring_n", "i8", N_QUEUES),
             ("ring", MEASUREMENT, (N_QUEUES, MEASUREMENT_CAPACITY)),
@@ -403,10 +404,9 @@ def layout(
     )
 
 
-def _of_rotors(model: np.dtype[np.void] | None) -> list[tuple[object, ...]]:
-    """Fields of a vehicle's model, of speeds that wait, and of the speeds at the state's time."""
-    n = 0 if model is None else model["yaw"].shape[0]
-    kind = _record(("k", "f8")) if model is None else np.dtype((np.record, model))
+def _of_rotors(n: int) -> list[tuple[object, ...]]:
+    """Fields of a vehicle's model of ``n`` rotors, of speeds that wait, and of the speeds at the state's time."""
+    kind = np.dtype((np.record, lumped_layout(n)))
     return [
         ("model", kind, (1 if n else 0,)),
         ("speed", "f8", (n,)),  # [rad/s], and their rates of change [rad/s^2]

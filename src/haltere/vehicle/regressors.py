@@ -21,16 +21,14 @@ from __future__ import annotations
 
 from typing import Any
 
-import numpy as np
-
 from haltere._jit import entry, jit
+from haltere.core.lumped import COLUMNS, lumped_layout
 from haltere.core.rotation import Vec, norm
 
 __all__ = ["AERO", "AXES", "COLUMNS", "NAMES", "PRESETS", "lumped_layout", "model", "predict", "regress", "regressors"]
 
-#: Axes of the model in the order of its rows (interface.md §3: model axes), and columns each has at most.
+#: Axes of the model in the order of its rows (interface.md §3: model axes).
 AXES = ("hx", "hy", "t", "r", "p", "q")
-COLUMNS = 5
 #: Names of the constants, as theory.md §5.2 numbers them, more after.
 NAMES: tuple[tuple[str, ...], ...] = (
     ("kHx0", "kHx1", "kHx2", "kHx3", "kHx4"),
@@ -57,22 +55,6 @@ AERO: tuple[tuple[bool, ...], ...] = (
 )
 
 Five = tuple[float, float, float, float, float]
-
-
-def lumped_layout(n: int) -> np.dtype[np.void]:
-    """Record type of a lumped model of ``n`` rotors: weights of the rotors, constants by axis and column (0 where a preset has none).
-
-    ``aero`` is 1 for the constants that go with the ratio of the air density to that of the constants, ``density`` [kg/m^3]. Speeds were
-    valid ``lag`` [s] before their stamps. ``sd``, ``slow``, ``ar1`` and ``window`` are what the model leaves, by axis, see
-    `haltere.estimators.lumped.Lumped`.
-    """
-    return np.dtype(
-        [
-            ("roll", "f8", n), ("pitch", "f8", n), ("yaw", "f8", n), ("k", "f8", (6, COLUMNS)), ("aero", "f8", (6, COLUMNS)),
-            ("literal", "i8"), ("density", "f8"), ("lag", "f8"), ("sd", "f8", 6), ("slow", "f8", 6), ("ar1", "f8", 6), ("window", "f8", 2),
-        ],
-        align=True,
-    )  # fmt: skip
 
 
 @jit
