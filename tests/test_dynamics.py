@@ -117,7 +117,7 @@ def _step(x: dict[str, FloatArray], M: Any, dt: float, keep: float) -> dict[str,
     C = dcm(tuple(float(c) for c in x["q"]))
     v_air = dynamics.air_velocity(C, three(x["v"]), float(x["wind"][0]), float(x["wind"][1]))
     f, a, *_ = linear(M[0], SPEEDS, SPIN_UP, v_air, three(x["w"]), three(x["w"]), 0.97)
-    dynamics.move(X[0], f, a, 9.81, dt, keep)
+    dynamics.move(X[0], f, a, 9.81, dt, keep, keep**2)
     return {k: np.array(X[k][0]) for k in x}
 
 
@@ -125,7 +125,7 @@ def _transition(x: dict[str, FloatArray], M: Any, dt: float, keep: float) -> Any
     C = dcm(tuple(float(c) for c in x["q"]))
     v_air = dynamics.air_velocity(C, three(x["v"]), float(x["wind"][0]), float(x["wind"][1]))
     f, _, D_a, D_w, M_a, M_w = linear(M[0], SPEEDS, SPIN_UP, v_air, three(x["w"]), three(x["w"]), 0.97)
-    return dynamics.transition(C, three(x["w"]), three(np.array(f) + x["bf"]), v_air, D_a, D_w, M_a, M_w, dt, keep)
+    return dynamics.transition(C, three(x["w"]), three(np.array(f) + x["bf"]), v_air, D_a, D_w, M_a, M_w, dt, keep, keep**2)
 
 
 def _dense(T: Any) -> FloatArray:
@@ -146,10 +146,11 @@ def test_transition_is_the_derivative_of_the_motion(seed: int) -> None:
     for dt in (1e-2, 1e-3):
         keep = float(np.exp(-dt / 3.0))
         middle = _step(x, M, dt, keep)
-        numeric = np.column_stack(
-            [(_error(_step(_with_error(x, h * e), M, dt, keep), middle) - _error(_step(_with_error(x, -h * e), M, dt, keep), middle)) / (2 * h)
-             for e in np.eye(22)]
-        )  # fmt: skip
+
+        def moved(e: FloatArray, x: Any = x, middle: Any = middle, dt: float = dt, keep: float = keep) -> FloatArray:
+            return _error(_step(_with_error(x, e), M, dt, keep), middle)
+
+        numeric = np.column_stack([(moved(h * e) - moved(-h * e)) / (2 * h) for e in np.eye(22)])
         A = _dense(_transition(x, M, dt, keep))
         assert np.array_equal(A[22:, 22:], np.eye(3)) and not A[:22, 22:].any() and not A[22:, :22].any()
         errors.append(np.abs(A[:22, :22] - numeric).max())

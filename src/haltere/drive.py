@@ -109,11 +109,20 @@ def run(
     attitude_only = asked["wind_attitude.filter"] == "quaternion"
     if smooth and attitude_only:
         raise UsageError("no smoothing of the published filter", f"{estimator}, preset {preset}", "--smooth", "preset default has it")
+    specification = SPECIFICATIONS[estimator]
+    if smooth and not getattr(specification, "SMOOTHS", True):
+        raise UsageError(
+            f"no smoothing of {estimator}", "--smooth", "run", "a federated filter cannot be taken back in time; navigator can"
+        )
+    if model is None and getattr(specification, "REQUIRES_VEHICLE", False):
+        raise UsageError(
+            "a vehicle file with [lumped]", "none", f"run of {estimator}",
+            "it predicts motion from rotor speeds: haltere identify LOG... --out vehicle.toml makes the file, --vehicle vehicle.toml gives it",
+        )  # fmt: skip
     flight = correct(flight, asked.values)
     blind = flight.without("onboard", "truth")
     checked = check(blind, upright=estimator != "ahrs", given=asked.values)
     resolved = configure(blind, checked, estimator, preset, asked)
-    specification = SPECIFICATIONS[estimator]
     t, gyro, accel = imu_arrays(blind, checked)
     offered = measurements(blind, checked, resolved)
     if model is not None:
@@ -341,6 +350,9 @@ def _optional(rows: FloatArray, S: NDArray[np.void]) -> tuple[dict[str, FloatArr
             np.exp(value, out=value)
             sd *= value
         values[name], deviations[f"sd_{name}"] = value, sd
+    if S["ft"].shape[1]:  # in the last columns, see `haltere.estimators.federated_step.row_width`
+        for i, name in enumerate(("wind_n", "wind_e")):
+            values[name], deviations[f"sd_{name}"] = rows[-4 + i], np.sqrt(np.maximum(rows[-2 + i], 0.0))
     return values, deviations
 
 

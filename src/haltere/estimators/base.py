@@ -30,6 +30,7 @@ from haltere.core.earth import STANDARD_GRAVITY, gravity
 from haltere.errors import HaltereError, UsageError
 from haltere.estimators import quaternion_step
 from haltere.estimators.air import steady_wind, vanes
+from haltere.estimators.federated_layout import federated
 from haltere.estimators.inputs import altitude_of, parameters, rotation_vector
 from haltere.estimators.lumped import Lumped
 from haltere.estimators.registry import kernels_of
@@ -38,6 +39,7 @@ from haltere.flight import config as configuration
 from haltere.flight.config import Config
 from haltere.flight.corrections import calibrated, calibration
 from haltere.flight.door import impossible_place, impossible_pressure
+from haltere.flight.exclusion import exclusion_table
 from haltere.flight.names import nearest_column, nearest_stream
 from haltere.flight.schema import column as schema_column
 from haltere.strapdown.layout import CORE, layout
@@ -78,7 +80,17 @@ class State:
         return bool(self.record["phase"][0] == 2)
 
     def _vector(self, name: str) -> FloatArray:
+        if self._federated:
+            x = self.record["ft"][0, 0]
+            own = {"bg": 0, "ba": 1}.get(name)
+            return np.array(x[name] if own is None else x["lf"][own]["own"], dtype=np.float64)
         return np.array(self.record[name][0], dtype=np.float64)
+
+    @property
+    def _federated(self) -> bool:
+        """Whether the state that counts is that of a federated filter."""
+        names = self.record.dtype.names or ()
+        return "ft" in names and self.record["ft"].shape[1] > 0 and bool(self.record["ft"]["on"][0, 0] == 1)
 
     @property
     def q_nb(self) -> FloatArray:
@@ -108,6 +120,11 @@ class State:
     @property
     def P(self) -> FloatArray:
         """Covariance of the error state: attitude (body), velocity, position, gyro bias, accelerometer bias, optional blocks."""
+        if self._federated:  # attitude, velocity, position; biases are of local filters
+            x, P = self.record["ft"][0, 0], np.zeros((15, 15))
+            P[:9, :9] = x["P"][3:12, 3:12]
+            P[9:12, 9:12], P[12:, 12:] = x["lf"][0]["P"][22:, 22:], x["lf"][1]["P"][22:, 22:]
+            return P
         return self._vector("P")
 
 
@@ -142,7 +159,13 @@ def new_state(config: Config, initial: InitialState | None = None, vehicle: Lump
     """State record, one element, that has seen nothing yet; with the model of a vehicle where one is given."""
     quaternion = config["wind_attitude.filter"] == "quaternion"
     model = None if vehicle is None else vehicle.record()
-    kind = quaternion_layout() if quaternion else layout(**_sizes(config), rotors=0 if vehicle is None else len(vehicle.yaw))
+    beside = federated() if config.estimator == "fault-tolerant" else None
+    if beside is not None and vehicle is None:
+        raise UsageError(
+            "a vehicle file with [lumped]", "none", config.estimator, "haltere identify LOG... --out vehicle.toml makes one; --vehicle"
+        )
+    rotors = 0 if vehicle is None else len(vehicle.yaw)
+    kind = quaternion_layout() if quaternion else layout(**_sizes(config), rotors=rotors, beside=beside)
     record = as_records(np.zeros(1, kind))
     if model is not None:
         record["model"][0, 0] = model[0]
@@ -161,6 +184,10 @@ def new_state(config: Config, initial: InitialState | None = None, vehicle: Lump
         record["has_field"] = 1
     if quaternion:
         _published(record, config)
+    if beside is not None:
+        record["ft"]["ground"] = 1e9
+        for i, sensor in enumerate(("gyro", "accel")):
+            record["ft"]["exclude"][0, 0, i] = exclusion_table(str(config[f"exclude.{sensor}"]))
     if initial is not None:
         if quaternion:
             _begin_quaternion(record, initial)

@@ -169,7 +169,7 @@ def parameters(config: Config) -> NDArray[np.void]:
     for name in PARAMETERS.names or ():
         if name in ("horizon", "covariance_interval", "imu_mean", "diagnosis_threshold"):
             continue
-        head = next((h for h in ("two_stage", "wind_attitude") if name.startswith(f"{h}_")), name.partition("_")[0])
+        head = next((h for h in ("two_stage", "wind_attitude", "fault_tolerant") if name.startswith(f"{h}_")), name.partition("_")[0])
         record[name] = config.number(f"{head}.{name[len(head) + 1 :]}")
     record["imu_mean"] = config.number("imu.kind")
     record["horizon"] = horizon(config)

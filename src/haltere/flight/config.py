@@ -25,6 +25,7 @@ PRESETS: dict[str, tuple[str, ...]] = {
     "ahrs": ("default",),
     "two-stage": ("default", "as-corrected", "as-printed"),
     "wind-attitude": ("default", "as-corrected", "as-printed"),
+    "fault-tolerant": ("default", "as-corrected"),
 }
 ESTIMATORS = tuple(PRESETS)
 
@@ -283,6 +284,23 @@ KEYS: dict[str, Key] = {
     "diagnosis.false_alarms": positive(0.035, "1/h", "Wanted rate of false alarms; lower finds faults later."),
     "diagnosis.gyro": Key(0.3 * DEG, "rad/s", "Change of a gyro bias that is no fault.", low=0.0),
     "diagnosis.accel": Key(0.08, "m/s^2", "Change of an accelerometer bias that is no fault.", low=0.0),
+    "fault_tolerant.detector": switch(
+        "windows",
+        "Detection filters of fault-tolerant: the largest of many windows of whitened residuals, or χ² of each one, as the source has it.",
+        ("windows", "snapshot"),
+    ),
+    "fault_tolerant.reset": switch(
+        "fusion", "Local filters take the fused state after each fusion, or keep their own opinion.", ("fusion", "none")
+    ),
+    "fault_tolerant.wind": switch("on", "Wind is a state of every chain that has the model; off: the air is taken to be still."),
+    "fault_tolerant.biases": switch("on", "Biases of sensors and model may change in flight; off: they are held as at take-off."),
+    "fault_tolerant.isolate": switch("on", "Leave out what the detection filters name; off: only say so."),
+    "fault_tolerant.fuse_rate": Key(20.0, "Hz", "Fusions a second; more is nearer to one filter with all sensors.", low=1.0, high=25.0),
+    "fault_tolerant.step": Key(
+        0.01, "s", "Step of covariances and detection filters: the IMU's samples are averaged over it.", low=0.002, high=0.05
+    ),
+    "fault_tolerant.wait": Key(2.5, "s", "How long alarms are gathered before a verdict.", low=0.1, high=10.0),
+    "fault_tolerant.recover": Key(5.0, "s", "How long an isolated sensor must agree again before it is heard.", low=0.5, high=60.0),
     "exclude.gyro": exclusion("Gyro axes that are not to be used, and when: a sensor known to be broken, or a trial without it."),
     "exclude.accel": exclusion("The same of the accelerometer."),
     "imu.kind": switch("instant", "An IMU sample is the value at its time, or the mean since the sample before.", ("instant", "mean")),
@@ -326,6 +344,7 @@ GROUPS: dict[str, tuple[str, ...]] = {
 }
 
 _DIAGNOSIS = tuple(key for key in KEYS if key.startswith("diagnosis."))
+_FAULT_TOLERANT = tuple(key for key in KEYS if key.startswith("fault_tolerant."))
 #: What only an estimator with a vehicle's model can do without.
 _EXCLUDE = tuple(key for key in KEYS if key.startswith("exclude."))
 _TWO_STAGE = tuple(key for key in KEYS if key.startswith("two_stage."))
@@ -345,6 +364,7 @@ _NO_AIR: dict[str, Value] = {"aid.drag": "off", "aid.airdata": "off", "aid.vanes
 #: What an estimator sets differently from the defaults above.
 _OVERRIDES: dict[str, dict[str, Value]] = {
     "navigator": {},
+    "fault-tolerant": {**_NO_AIR, "diagnosis.inertial": "off"},
     "ahrs": {
         "aid.gnss": "off", "aid.barometer": "off", "aid.fake_velocity": "on", "aid.fake_position": "off", "baro.offset": "off",
         "diagnosis.inertial": "off",
@@ -379,6 +399,9 @@ _PRESET_OVERRIDES["wind-attitude", "as-printed"] = _PRESET_OVERRIDES["wind-attit
     "wind_attitude.residual": "printed", "wind_attitude.rows": "printed", "wind_attitude.normalise": "off",
     "wind_attitude.angles": "arctan", "wind_attitude.force": _NO_GATE, "wind_attitude.acceleration": _NO_GATE,
 }  # fmt: skip
+_PRESET_OVERRIDES["fault-tolerant", "as-corrected"] = {
+    "fault_tolerant.detector": "snapshot", "fault_tolerant.wind": "off", "fault_tolerant.biases": "off", "diagnosis.inertial": "off",
+}  # fmt: skip
 #: Where the keys begin that the published filter of wind-attitude is told; noise and delays a flight may tell of any sensor.
 _QUATERNION = (
     "noise.", "delay.", "gate.magnetometer", "gate.air", "aid.gnss", "aid.magnetometer", "aid.airdata", "aid.wind", "timeout.magnetometer",
@@ -387,10 +410,12 @@ _QUATERNION = (
 )  # fmt: skip
 #: Keys that an estimator does not have: changing them would change nothing, or make it another one.
 _FIXED: dict[str, tuple[str, ...]] = {
-    "navigator": (*_TWO_STAGE, *_WIND_ATTITUDE, *_GIVEN_WIND, *_EXCLUDE),
-    "ahrs": (*_OVERRIDES["ahrs"], *_TWO_STAGE, *_AIR, *_WIND_ATTITUDE, *_DIAGNOSIS, *_EXCLUDE),
-    "wind-attitude": (*_TWO_STAGE, *_DIAGNOSIS, *_EXCLUDE, "wind_attitude.filter"),
+    "navigator": (*_TWO_STAGE, *_WIND_ATTITUDE, *_GIVEN_WIND, *_FAULT_TOLERANT, *_EXCLUDE),
+    "fault-tolerant": (*_TWO_STAGE, *_WIND_ATTITUDE, *_GIVEN_WIND, *_NO_AIR, "magnetometer.refine"),
+    "ahrs": (*_OVERRIDES["ahrs"], *_TWO_STAGE, *_AIR, *_WIND_ATTITUDE, *_DIAGNOSIS, *_FAULT_TOLERANT, *_EXCLUDE),
+    "wind-attitude": (*_TWO_STAGE, *_DIAGNOSIS, *_FAULT_TOLERANT, *_EXCLUDE, "wind_attitude.filter"),
     "two-stage": (
+        *_FAULT_TOLERANT,
         *_EXCLUDE,
         *_WIND_ATTITUDE,
         *_AIR,
@@ -423,6 +448,7 @@ _LACKS: dict[str, dict[str, tuple[str, ...]]] = {
     "ahrs": {"aid.magnetometer": ("orthonormal",)},
     "two-stage": {"aid.magnetometer": ("heading", "3-axis")},
     "wind-attitude": {"aid.magnetometer": ("orthonormal",)},
+    "fault-tolerant": {"aid.magnetometer": ("orthonormal",)},
 }
 _LACKS_PRESET: dict[tuple[str, str], dict[str, tuple[str, ...]]] = {
     ("wind-attitude", preset): {"aid.magnetometer": ("heading", "orthonormal"), "aid.airdata": ("auto",)}
@@ -470,6 +496,9 @@ def defaults(estimator: str = "navigator", preset: str = "default") -> dict[str,
         raise UsageError("an estimator", repr(estimator), "--estimator", hint)
     if preset not in PRESETS[estimator]:
         alone = f"{estimator} is not one of the published designs, so it has no printed or corrected form"
+        if estimator == "fault-tolerant":
+            lost = "the printed thresholds of source F are lost, and most of its formulas with them; as-corrected is as near as can be"
+            raise UsageError(f"a preset of {estimator} ({', '.join(PRESETS[estimator])})", repr(preset), "--preset", lost)
         raise UsageError(
             f"a preset of {estimator} ({', '.join(PRESETS[estimator])})",
             repr(preset),

@@ -5,6 +5,7 @@ attitude, velocity, position, error of the moments b_M [rad/s^2] and of the spec
 east). Errors are true minus estimate, that of the attitude in the body frame; 22 of them, in this order:
 
 δω̇ = M_ω δω + M_a δv_a + δb_M;  δθ̇ = -[ω]× δθ + δω;  δv̇ = C (-[f]× δθ + D_ω δω + D_a δv_a + δb_F);  δṗ = δv;  Ẇ = -(W - W̄)/τ,
+ḃ = -b/τ_b,
 
 where δv_a = [v_a]× δθ + Cᵀ (δv - δW). Three states of a filter's own may follow; they are constant.
 """
@@ -39,9 +40,9 @@ __all__ = [
 RATE, ATTITUDE, SPEED, PLACE, MOMENT, FORCE, WIND, MEAN, OWN = (constant(i) for i in (0, 3, 6, 9, 12, 15, 18, 20, 22))
 COMMON, STATES = 22, 25
 
-#: Blocks of the transition that are neither zero nor one: ω ← ω, θ, v; θ ← θ; v ← ω, θ, v, b_F; then the interval [s] and what is left of
-#: a gust after it. Against the wind, ω and v go as against v with the other sign.
-Transition = tuple[Mat, Mat, Mat, Mat, Mat, Mat, Mat, Mat, float, float]
+#: Blocks of the transition that are neither zero nor one: ω ← ω, θ, v; θ ← θ; v ← ω, θ, v, b_F; then the interval [s], and what is left
+#: after it of a gust, and of b_M and b_F. Against the wind, ω and v go as against v with the other sign.
+Transition = tuple[Mat, Mat, Mat, Mat, Mat, Mat, Mat, Mat, float, float, float]
 
 
 @jit
@@ -51,10 +52,10 @@ def air_velocity(C: Mat, v: Vec, north: float, east: float) -> Vec:
 
 
 @jit
-def move(x: Any, f: Vec, a: Vec, gravity: float, dt: float, keep: float) -> None:
+def move(x: Any, f: Vec, a: Vec, gravity: float, dt: float, keep: float, leak: float) -> None:
     """Advance a nominal state by specific force ``f`` [m/s^2] and angular acceleration ``a`` [rad/s^2] held over the interval.
 
-    Both without b_F and b_M, which the state adds. ``keep`` is what is left of a gust.
+    Both without b_F and b_M, which the state adds. ``keep`` is what is left of a gust, ``leak`` of b_F and b_M.
     """
     w = (x.w[0], x.w[1], x.w[2])
     a = (a[0] + x.bm[0], a[1] + x.bm[1], a[2] + x.bm[2])
@@ -69,6 +70,8 @@ def move(x: Any, f: Vec, a: Vec, gravity: float, dt: float, keep: float) -> None
         g = push[i] + (gravity if i == 2 else 0.0)
         x.p[i] += dt * (x.v[i] + 0.5 * dt * g)
         x.v[i] += dt * g
+        x.bm[i] *= leak
+        x.bf[i] *= leak
     for i in range(2):
         x.wind[i] = keep * x.wind[i] + (1.0 - keep) * x.steady[i]
 
@@ -106,7 +109,9 @@ def plus_one(m: Mat) -> Mat:
 
 
 @jit
-def transition(C: Mat, w: Vec, f: Vec, v_air: Vec, D_a: Mat, D_w: Mat, M_a: Mat, M_w: Mat, dt: float, keep: float) -> Transition:
+def transition(
+    C: Mat, w: Vec, f: Vec, v_air: Vec, D_a: Mat, D_w: Mat, M_a: Mat, M_w: Mat, dt: float, keep: float, leak: float
+) -> Transition:
     """Transition of the error over ``dt``, first order but for the turn of the body.
 
     Parameters
@@ -119,8 +124,8 @@ def transition(C: Mat, w: Vec, f: Vec, v_air: Vec, D_a: Mat, D_w: Mat, M_a: Mat,
         Velocity through the air, body [m/s].
     D_a, D_w, M_a, M_w
         Derivatives of the model, see `haltere.vehicle.linear.linear`.
-    dt, keep
-        Interval [s], and what is left of a gust after it.
+    dt, keep, leak
+        Interval [s], and what is left after it of a gust, and of what the model misses.
     """
     Ct = transpose(C)
     S = cross_matrix(v_air)
@@ -137,6 +142,7 @@ def transition(C: Mat, w: Vec, f: Vec, v_air: Vec, D_a: Mat, D_w: Mat, M_a: Mat,
         times(dt, C),
         dt,
         keep,
+        leak,
     )
 
 
@@ -149,7 +155,7 @@ def row_times(m: Vec, a: float, b: float, c: float) -> float:
 @jit
 def left(P: Any, n: int, T: Transition) -> None:
     """P <- A P, a column at a time."""
-    Aww, Awt, Awv, Att, Avw, Avt, Avv, AvF, dt, keep = T
+    Aww, Awt, Awv, Att, Avw, Avt, Avv, AvF, dt, keep, leak = T
     for j in range(n):
         w0, w1, w2 = P[0, j], P[1, j], P[2, j]
         t0, t1, t2 = P[3, j], P[4, j], P[5, j]
@@ -170,6 +176,8 @@ def left(P: Any, n: int, T: Transition) -> None:
         P[0, j] = row_times(Aww[0], w0, w1, w2) + row_times(Awt[0], t0, t1, t2) + row_times(Awv[0], a0, a1, a2) + dt * P[12, j]
         P[1, j] = row_times(Aww[1], w0, w1, w2) + row_times(Awt[1], t0, t1, t2) + row_times(Awv[1], a0, a1, a2) + dt * P[13, j]
         P[2, j] = row_times(Aww[2], w0, w1, w2) + row_times(Awt[2], t0, t1, t2) + row_times(Awv[2], a0, a1, a2) + dt * P[14, j]
+        for i in range(12, 18):
+            P[i, j] *= leak
         P[18, j] = keep * P[18, j] + (1.0 - keep) * P[20, j]
         P[19, j] = keep * P[19, j] + (1.0 - keep) * P[21, j]
 
@@ -188,7 +196,7 @@ def carry(s: Any, T: Transition) -> None:
 @jit
 def carry_vector(x: Any, T: Transition) -> None:
     """An error vector (25) over one interval, x <- A x."""
-    Aww, Awt, Awv, Att, Avw, Avt, Avv, AvF, dt, keep = T
+    Aww, Awt, Awv, Att, Avw, Avt, Avv, AvF, dt, keep, leak = T
     w, t = (x[0], x[1], x[2]), (x[3], x[4], x[5])
     a, b = (x[6] - x[18], x[7] - x[19], x[8]), (x[15], x[16], x[17])
     d = add(add(mat_vec(Avw, w), mat_vec(Avt, t)), add(mat_vec(Avv, a), mat_vec(AvF, b)))
@@ -199,5 +207,7 @@ def carry_vector(x: Any, T: Transition) -> None:
         x[6 + i] += d[i]
         x[3 + i] = t1[i] + dt * w[i]
         x[i] = w1[i] + dt * x[12 + i]
+        x[12 + i] *= leak
+        x[15 + i] *= leak
     for i in range(2):
         x[18 + i] = keep * x[18 + i] + (1.0 - keep) * x[20 + i]

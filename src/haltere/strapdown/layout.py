@@ -295,6 +295,8 @@ PARAMETERS = np.dtype(
             "diagnosis_inertial diagnosis_gyro diagnosis_accel diagnosis_threshold "
             "wind_attitude_integrator wind_attitude_residual wind_attitude_rows wind_attitude_normalise wind_attitude_angles "
             "wind_attitude_accel wind_attitude_force wind_attitude_acceleration wind_attitude_gate wind_attitude_air "
+            "fault_tolerant_detector fault_tolerant_reset fault_tolerant_wind fault_tolerant_biases fault_tolerant_isolate "
+            "fault_tolerant_fuse_rate fault_tolerant_step fault_tolerant_wait fault_tolerant_recover "
             "imu_mean horizon covariance_interval"
         ).split()
     ],
@@ -305,7 +307,7 @@ PARAMETERS = np.dtype(
 @cache
 def layout(
     baro: int = 0, mag: int = 0, stages: int = 0, wind: int = 0, drag: int = 0, vane: int = 0, banks: int = 0,
-    rotors: int = 0,
+    rotors: int = 0, beside: np.dtype[np.void] | None = None,
 ) -> np.dtype[np.void]:  # fmt: skip
     """State record type.
 
@@ -327,6 +329,8 @@ def layout(
         1 with the memory of diagnosis, else 0.
     rotors
         Number of rotors of the vehicle's model, 0 without one.
+    beside
+        Record type of what an estimator remembers beside all this (`fault-tolerant`); None for nothing.
 
     Returns
     -------
@@ -396,6 +400,7 @@ def layout(
             ("a", STAGE, (stages,)),
             ("bank", bank(n), (banks,)),
             *_of_rotors(rotors),
+            ("ft", _record(("on", "i8")) if beside is None else beside, (0 if beside is None else 1,)),
             ("ring_head", "i8", N_QUEUES),
             ("ring_n", "i8", N_QUEUES),
             ("ring", MEASUREMENT, (N_QUEUES, MEASUREMENT_CAPACITY)),

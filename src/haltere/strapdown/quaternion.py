@@ -72,6 +72,7 @@ def quaternion_layout() -> np.dtype[np.void]:
             ("imu_n", "i8"),
             ("imu", IMU_SAMPLE, (IMU_CAPACITY,)),
             ("a", STAGE, (0,)),
+            ("ft", "i8", (0,)),
             ("ring_head", "i8", N_QUEUES),
             ("ring_n", "i8", N_QUEUES),
             ("ring", MEASUREMENT, (N_QUEUES, CAPACITY)),

@@ -1,0 +1,107 @@
+"""What `fault-tolerant` remembers beside an ordinary filter, as record types: fused state, local filters, detection filters. No arithmetic."""
+
+from __future__ import annotations
+
+from functools import cache
+
+import numpy as np
+
+from haltere._jit import constant
+from haltere.aids.record import AID_RECORD
+from haltere.filter.windows import windows
+
+__all__ = [
+    "DUE", "FAST", "FAST_WINDOW", "FEDERATED", "FINDINGS", "LF_ACCEL", "LF_BARO", "LF_GNSS", "LF_GYRO", "LF_MAG", "LOCAL_FILTERS",
+    "N_DETECTORS", "SLOW", "SLOW_WINDOW", "federated",
+]  # fmt: skip
+
+#: Local filters (theory.md §5.6).
+LF_GYRO, LF_ACCEL, LF_MAG, LF_GNSS, LF_BARO = (constant(i) for i in range(5))
+LOCAL_FILTERS = constant(5)
+#: Detection filters: J11-J16, each of one axis of the IMU against the model; then J21-J24 and J31-J34, model and IMU against compass, GNSS
+#: velocity, barometer, GNSS position.
+N_DETECTORS = 14
+FAST, SLOW = constant(6), constant(8)
+#: Longest windows in samples: 10 s of the filter's own steps, and at least 6 s of a sensor's.
+FAST_WINDOW, SLOW_WINDOW = 1024, 256
+#: Measurements between two steps, and findings, that there is room for.
+DUE, FINDINGS = 64, 32
+
+
+def _record(*fields: tuple[object, ...]) -> np.dtype[np.void]:
+    return np.dtype((np.record, list(fields)), align=True)
+
+
+#: See `haltere.strapdown.dynamics`.
+_NOMINAL: tuple[tuple[object, ...], ...] = (
+    ("w", "f8", 3), ("q", "f8", 4), ("v", "f8", 3), ("p", "f8", 3), ("bm", "f8", 3), ("bf", "f8", 3), ("wind", "f8", 2), ("steady", "f8", 2),
+)  # fmt: skip
+_UPDATED: tuple[tuple[object, ...], ...] = (("P", "f8", (25, 25)), ("dx", "f8", 25), ("u", "f8", 25), ("k", "f8", 25))
+#: A local filter: its correction ``dx`` is about the fused nominal state; its own states are a sensor's bias.
+LOCAL = _record(*_UPDATED, ("own", "f8", 3), ("gain", "f8", (3, 22)), ("axes", "i8"), ("t_back", "f8", 3))
+#: The model's own chain, which hears compass, GNSS and barometer but no IMU (J21-J24).
+CHAIN = _record(*_NOMINAL, *_UPDATED, ("baro", "f8"))
+#: Force of the model against the accelerometer (J11-J13): what the model misses, wind and its mean.
+AIR_CHAIN = _record(("x", "f8", 7), ("P", "f8", (7, 7)), ("dx", "f8", 7), ("u", "f8", 7), ("k", "f8", 7))
+#: A measurement that waits for the next step.
+_DUE = _record(("kind", "i8"), ("t", "f8"), ("z", "f8", 3), ("r", "f8", 3))
+#: What a verdict rests on: when each detection filter first alarmed (0: did not), and the largest statistic over its level.
+FINDING = _record(("when", "f8", N_DETECTORS), ("most", "f8", N_DETECTORS))
+
+
+@cache
+def federated() -> np.dtype[np.void]:
+    """Record type of `fault-tolerant`'s own memory."""
+    return _record(
+        ("on", "i8"),  # 1: the fused state is that of the vehicle's physics; 0: on the ground, or rotors not known
+        ("t", "f8"),
+        *_NOMINAL,
+        ("f", "f8", 3),  # force and angular acceleration of the model at the state, without b_F and b_M
+        ("a", "f8", 3),
+        ("P", "f8", (22, 22)),
+        ("dx", "f8", 22),
+        ("y", "f8", 22),
+        ("work", "f8", (22, 22)),
+        ("lf", LOCAL, (int(LOCAL_FILTERS),)),
+        ("t_fuse", "f8"),
+        ("n_fused", "i8"),
+        # since the last step: samples, seconds, sums of what the sensors show over the nominal state
+        ("n", "i8"),
+        ("span", "f8"),
+        ("by_gyro", "f8", 3),
+        ("by_accel", "f8", 3),
+        ("n_due", "i8"),
+        ("due", _DUE, (DUE,)),
+        ("heard", AID_RECORD, (128,)),
+        ("nothing", "f8", (0, 0)),
+        # take-off and landing
+        ("t_light", "f8"),
+        ("t_heavy", "f8"),
+        ("t_begun", "f8"),
+        ("ground", "f8"),
+        # detection
+        ("chain", CHAIN),
+        ("air", AIR_CHAIN),
+        ("axis", "f8", (3, 2)),  # rate and b_M of J14-J16 with their covariance (xx, xy, yy)
+        ("axis_P", "f8", (3, 3)),
+        ("fast", windows(FAST_WINDOW), (int(FAST),)),
+        ("slow", windows(SLOW_WINDOW), (int(SLOW),)),
+        ("level", "f8", N_DETECTORS),
+        ("rho", "f8", N_DETECTORS),
+        ("pending", "f8", (2, 3)),
+        ("when", "f8", N_DETECTORS),
+        ("most", "f8", N_DETECTORS),
+        ("alarms", "i8"),
+        ("t_first", "f8"),
+        ("t_quiet", "f8"),
+        ("off", "i8"),  # detection filters that contain what is isolated
+        ("verdict", "i8"),
+        ("isolated", "i8"),  # sensors' axes and model's axes that are isolated, a bit each
+        ("t_isolated", "f8", 32),
+        ("n_findings", "i8"),
+        ("finding", FINDING, (FINDINGS,)),
+        ("exclude", "f8", (2, 4, 3)),  # gyro and accelerometer: axes, from, to
+    )  # fmt: skip
+
+
+FEDERATED = federated()
