@@ -23,6 +23,7 @@ from haltere.estimators.registry import SPECIFICATIONS, kernels_of
 from haltere.estimators.rotors import model_of, rotor_speeds
 from haltere.estimators.smoother import node_width, smoothed
 from haltere.estimators.step import COVARIANCE_ROWS
+from haltere.estimators.verdicts import VERDICTS, verdict
 from haltere.flight.config import Config
 from haltere.flight.corrections import correct
 from haltere.flight.door import Checked, check, fit
@@ -264,6 +265,9 @@ def _drain(S: NDArray[np.void], aids: NDArray[np.void], parts: list[NDArray[np.v
         kind = EVENTS[int(e["code"])]
         if kind in ("fault", "suspect", "over"):
             findings(kind, e, events)
+            continue
+        if kind in VERDICTS:
+            verdict(kind, e, S, events)
             continue
         named = kind in ("reset", "timeout", "recovered", "disturb")
         sensor = SENSORS[int(e["sensor"])] if named else ("imu" if kind == "gap" else "filter")

@@ -30,6 +30,7 @@ from haltere.core.earth import STANDARD_GRAVITY, gravity
 from haltere.errors import HaltereError, UsageError
 from haltere.estimators import quaternion_step
 from haltere.estimators.air import steady_wind, vanes
+from haltere.estimators.detection_levels import detection_levels
 from haltere.estimators.federated_layout import federated
 from haltere.estimators.inputs import altitude_of, parameters, rotation_vector
 from haltere.estimators.lumped import Lumped
@@ -186,6 +187,7 @@ def new_state(config: Config, initial: InitialState | None = None, vehicle: Lump
         _published(record, config)
     if beside is not None:
         record["ft"]["ground"] = 1e9
+        record["ft"]["level"][0, 0], record["ft"]["rho"][0, 0] = detection_levels(config)
         for i, sensor in enumerate(("gyro", "accel")):
             record["ft"]["exclude"][0, 0, i] = exclusion_table(str(config[f"exclude.{sensor}"]))
     if initial is not None:

@@ -70,6 +70,7 @@ def federated() -> np.dtype[np.void]:
         ("span", "f8"),
         ("by_gyro", "f8", 3),
         ("by_accel", "f8", 3),
+        ("by_model", "f8", 3),  # and of the model's angular acceleration
         ("n_due", "i8"),
         ("due", _DUE, (DUE,)),
         ("heard", AID_RECORD, (128,)),
@@ -88,14 +89,15 @@ def federated() -> np.dtype[np.void]:
         ("slow", windows(SLOW_WINDOW), (int(SLOW),)),
         ("level", "f8", N_DETECTORS),
         ("rho", "f8", N_DETECTORS),
-        ("pending", "f8", (2, 3)),
+        ("last", "f8", N_DETECTORS),  # statistic over level, now and at most
         ("when", "f8", N_DETECTORS),
         ("most", "f8", N_DETECTORS),
         ("alarms", "i8"),
         ("t_first", "f8"),
-        ("t_quiet", "f8"),
+        ("t_alarm", "f8"),
+        ("t_chain", "f8"),
+        ("armed", "i8"),
         ("off", "i8"),  # detection filters that contain what is isolated
-        ("verdict", "i8"),
         ("isolated", "i8"),  # sensors' axes and model's axes that are isolated, a bit each
         ("t_isolated", "f8", 32),
         ("n_findings", "i8"),

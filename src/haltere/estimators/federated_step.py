@@ -15,6 +15,8 @@ from haltere.aids.record import BAROMETER, GNSS_POSITION, GNSS_VELOCITY, MAGNETO
 from haltere.core.earth import STANDARD_DENSITY
 from haltere.core.rotation import Vec, dcm, mat_vec, quat_from_rotvec, quat_mul, quat_unit
 from haltere.estimators import step as ordinary
+from haltere.estimators.detection_filters import detect_external, detect_inertial, detect_of_the_imu, reseed, watch
+from haltere.estimators.isolation import decide
 from haltere.estimators.local_filters import MISS_TIME, evaluate, fuse_inertial, fuse_sensors, fusion, predict_all
 from haltere.estimators.local_states import begin, set_axes
 from haltere.estimators.step import COVARIANCE_ROWS, LONG_STEP, begin_air, behind, hear_rotors, offer, offer_rotors, take
@@ -117,6 +119,7 @@ def advance(s: Any, prm: Any, rows: Any, cov: Any, aids: Any, tape: Any, stage: 
     if x.on == 0 and flies and s.phase == 2:
         begin(s, prm, t)
         evaluate(s, prm)
+        reseed(s, prm)
         x.n_due = 0
     elif x.on == 1:
         go_on(s, prm, t, dt, w1, f1, n_heard)
@@ -134,21 +137,28 @@ def go_on(s: Any, prm: Any, t: float, dt: float, w1: Vec, f1: Vec, n_heard: int)
     x = s.ft[0]
     move(x, (x.f[0], x.f[1], x.f[2]), (x.a[0], x.a[1], x.a[2]), s.gravity, dt, math.exp(-dt / prm.air_gust_time), math.exp(-dt / MISS_TIME))
     evaluate(s, prm)
+    detect_of_the_imu(s, prm, n_heard)
     x.n += 1
     x.span += dt
     for a in range(3):
         x.by_gyro[a] += w1[a] - x.w[a]
         x.by_accel[a] += f1[a] - x.f[a] - x.bf[a]
+        x.by_model[a] += x.a[a]
     if x.span < prm.fault_tolerant_step - 0.5 * dt:
         return
     k = 1.0 / x.n
     gyro = (k * x.by_gyro[0], k * x.by_gyro[1], k * x.by_gyro[2])
     accel = (k * x.by_accel[0], k * x.by_accel[1], k * x.by_accel[2])
+    turned = (k * x.by_model[0], k * x.by_model[1], k * x.by_model[2])
     span = x.span
     x.n, x.span = 0, 0.0
     for a in range(3):
-        x.by_gyro[a], x.by_accel[a] = 0.0, 0.0
-    lin, C, v, T = predict_all(s, prm, span)
+        x.by_gyro[a], x.by_accel[a], x.by_model[a] = 0.0, 0.0, 0.0
+    lin, C, v = predict_all(s, prm, span)
+    watch(s, prm, t)
+    detect_inertial(s, prm, lin, C, gyro, accel, turned, span)
+    detect_external(s, prm, span)
+    decide(s, prm, t)
     fuse_inertial(s, prm, lin, C, v, gyro, accel, span)
     fuse_sensors(s, prm, C)
     x.n_due = 0

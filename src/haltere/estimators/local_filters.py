@@ -1,4 +1,4 @@
-"""The federated filter of `fault-tolerant`: prediction by the vehicle's model, local filters of gyro, accelerometer, compass, GNSS, barometer.
+"""The federated filter of `fault-tolerant`: prediction by the vehicle's model, and a local filter for each sensor.
 
 Step 5 of source F (theory.md §5.3, §5.6; theory-amendments.md 1, 2, 4). All are about one nominal state, driven by rotor speeds alone; what
 a sensor shows beyond it is heard by its local filter, and the fusion moves the nominal state. The detection filters are elsewhere.
@@ -27,7 +27,6 @@ from haltere.strapdown.dynamics import (
     RATE,
     SPEED,
     WIND,
-    Transition,
     air_velocity,
     carry,
     carry_vector,
@@ -42,6 +41,8 @@ __all__ = ["add_noise", "alive", "compass_row", "evaluate", "fuse_sensors", "fus
 
 #: How long what the model misses of force and moment lasts [s], and least 1 sigma of it [m/s^2, rad/s^2].
 MISS_TIME = 1.0
+#: What an angular acceleration is off by, as a part of it.
+RELATIVE = 0.1
 #: Shares of the fused information.
 SHARES = (0.5, 0.4, 0.034, 0.033, 0.033)
 FORCE_LEAST, MOMENT_LEAST = 0.05, 0.05
@@ -100,6 +101,24 @@ def evaluate(s: Any, prm: Any) -> None:
 
 
 @jit
+def miss(s: Any, axis: int) -> float:
+    """1 sigma of what the model misses for a while, by axis hx hy t r p q [m/s^2, rad/s^2]."""
+    return max(s.model[0].slow[axis], FORCE_LEAST if axis < 3 else MOMENT_LEAST)
+
+
+@jit
+def swing_noise(s: Any, a: int) -> float:
+    """Spectral density of what the model's angular acceleration about an axis misses for a moment [rad^2/s^3].
+
+    What identification left in its windows, and a part of the angular acceleration itself: rotor speeds come late and are not quite right.
+    """
+    x, m = s.ft[0], s.model[0]
+    sd = m.sd[3 + a]
+    part = RELATIVE * (x.a[a] + x.bm[a])
+    return (sd * sd + part * part) * m.window[1]
+
+
+@jit
 def add_noise(s: Any, prm: Any, P: Any, C: Mat, dt: float, share: float) -> None:
     """Noise of the process over one interval, ``share`` (1/β) times: what the model misses, gusts, walks of sensors' biases not."""
     m, x = s.model[0], s.ft[0]
@@ -107,12 +126,12 @@ def add_noise(s: Any, prm: Any, P: Any, C: Mat, dt: float, share: float) -> None
     wind = math.sqrt(x.steady[0] * x.steady[0] + x.steady[1] * x.steady[1])
     gust = prm.air_gust + prm.air_turbulence * wind
     for i in range(3):
-        moment, force = max(m.slow[3 + i], MOMENT_LEAST), max(m.slow[i], FORCE_LEAST)
+        moment, force = miss(s, 3 + i), miss(s, i)
         if x.isolated & (1 << (6 + i)):
             force = FORCE_FREE
         if x.isolated & (1 << (9 + i)):
             moment = MOMENT_FREE
-        P[i, i] += k * m.sd[3 + i] * m.sd[3 + i] * m.window[1]
+        P[i, i] += k * swing_noise(s, i)
         P[3 + i, 3 + i] += k * 1e-9
         P[9 + i, 9 + i] += k * 1e-6
         P[12 + i, 12 + i] += k * 2.0 * moment * moment / MISS_TIME
@@ -129,7 +148,7 @@ def add_noise(s: Any, prm: Any, P: Any, C: Mat, dt: float, share: float) -> None
 
 
 @jit
-def predict_all(s: Any, prm: Any, dt: float) -> tuple[Linear, Mat, Vec, Transition]:
+def predict_all(s: Any, prm: Any, dt: float) -> tuple[Linear, Mat, Vec]:
     """Covariances and corrections of all local filters over one step; the nominal state is there already."""
     x = s.ft[0]
     lin, C, v = linear_at(s, prm, x)
@@ -152,7 +171,7 @@ def predict_all(s: Any, prm: Any, dt: float) -> tuple[Linear, Mat, Vec, Transiti
             if prm.fault_tolerant_biases > 0.0:
                 for a in range(3):
                     f.P[22 + a, 22 + a] += walk * walk * dt
-    return lin, C, v, T
+    return lin, C, v
 
 
 @jit

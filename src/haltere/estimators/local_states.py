@@ -6,8 +6,7 @@ from typing import Any
 
 from haltere._jit import jit
 from haltere.estimators.federated_layout import LF_ACCEL, LF_BARO, LF_GYRO, LOCAL_FILTERS
-from haltere.estimators.local_filters import FORCE_LEAST, MOMENT_LEAST, SHARES
-from haltere.filter.windows import empty
+from haltere.estimators.local_filters import SHARES, miss
 
 __all__ = ["begin", "set_axes"]
 
@@ -18,7 +17,7 @@ RATE_SD = 0.1
 @jit
 def begin(s: Any, prm: Any, t: float) -> None:
     """Take the ordinary filter's state for the fused one, and share it out; of the wind nothing is known."""
-    x, m = s.ft[0], s.model[0]
+    x = s.ft[0]
     wind = prm.init_wind * prm.init_wind if prm.fault_tolerant_wind > 0.0 else 1e-12
     for i in range(22):
         x.dx[i] = 0.0
@@ -28,8 +27,8 @@ def begin(s: Any, prm: Any, t: float) -> None:
         x.w[i], x.v[i], x.p[i] = s.w_raw[i] - s.bg[i], s.v[i], s.p[i]
         x.bm[i], x.bf[i], x.a[i] = 0.0, 0.0, 0.0
         x.P[i, i] = RATE_SD * RATE_SD
-        x.P[12 + i, 12 + i] = max(m.slow[3 + i], MOMENT_LEAST) ** 2
-        x.P[15 + i, 15 + i] = max(m.slow[i], FORCE_LEAST) ** 2
+        x.P[12 + i, 12 + i] = miss(s, 3 + i) ** 2
+        x.P[15 + i, 15 + i] = miss(s, i) ** 2
     for i in range(9):
         for j in range(9):
             x.P[3 + i, 3 + j] = s.P[i, j]
@@ -59,11 +58,7 @@ def begin(s: Any, prm: Any, t: float) -> None:
     x.on, x.t_begun, x.t_fuse, x.n_fused = 1, t, t, 0
     x.n, x.span = 0, 0.0
     for a in range(3):
-        x.by_gyro[a], x.by_accel[a] = 0.0, 0.0
-    for i in range(len(x.fast)):
-        empty(x.fast[i])
-    for i in range(len(x.slow)):
-        empty(x.slow[i])
+        x.by_gyro[a], x.by_accel[a], x.by_model[a] = 0.0, 0.0, 0.0
 
 
 @jit

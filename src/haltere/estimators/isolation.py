@@ -1,0 +1,197 @@
+"""What `fault-tolerant` does with alarms: gathers them, names the fault by its signature, leaves out what failed, hears it again later.
+
+Source F, steps 4 to 6 (theory.md §5.5, §5.6). A verdict comes when a signature is complete and no other fits, else after
+``fault_tolerant.wait`` with what there is; several that fit are returned as a set, and nothing is left out then.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+from haltere._jit import constant, jit
+from haltere.aids.record import E_ISOLATED, E_READMITTED, E_UNDECIDED, NO_SENSOR, event_since
+from haltere.diagnosis.truth_table import MAY, MUST, N_FAULTS, count, match
+from haltere.estimators.detection_filters import reseed
+from haltere.estimators.federated_layout import FINDINGS, LOCAL_FILTERS, N_DETECTORS
+
+__all__ = ["decide"]
+
+#: Numbers of faults in `haltere.diagnosis.truth_table.FAULTS`: first of the gyro, of the accelerometer, of the model; then each.
+GYRO, ACCEL, MODEL, COMPASS, VELOCITY, BARO, POSITION, ROTOR, WIND = (constant(i) for i in (0, 3, 6, 12, 13, 14, 15, 16, 17))
+#: A complete signature must have had no new alarm for so long [s].
+SETTLED = 0.4
+#: What a fault may have done to the fused state until it was named, 1 sigma: attitude [rad], velocity [m/s], height [m], wind [m/s].
+TURNED, PUSHED, LIFTED, BLOWN = math.radians(3.0), 0.5, 1.0, 4.0
+#: Bits of the detection filters that hear a sensor: of the IMU chain, of the model's chain, of both by what they hear.
+BY_IMU, BY_MODEL = constant(0b1111 << 10), constant(0b1111 << 6)
+
+
+@jit
+def parts_of(fault: int) -> int:
+    """Bits of what is isolated for a fault, see `haltere.estimators.local_states.set_axes`."""
+    if fault == ROTOR:
+        return 0b1111 << 8
+    return 0 if fault == WIND else 1 << fault
+
+
+@jit
+def filters_of(parts: int) -> int:
+    """Bits of the detection filters that contain any of what is isolated."""
+    off = 0
+    for a in range(3):
+        if parts & ((1 << a) | (1 << (9 + a))):
+            off |= 1 << (3 + a)
+        if parts & ((1 << (3 + a)) | (1 << (6 + a))):
+            off |= 1 << a
+    if parts & 0b111111:
+        off |= BY_IMU
+    if parts & (0b111111 << 6):
+        off |= BY_MODEL
+    for k in range(4):
+        if parts & (1 << (12 + k)):
+            off |= (1 << (6 + k)) | (1 << (10 + k))
+    return off
+
+
+@jit
+def doubt(s: Any, i: int, variance: float) -> None:
+    """Admit that a shared state may be wrong by as much as that: in the fused covariance, and in all that is shared."""
+    x = s.ft[0]
+    x.P[i, i] += variance
+    for k in range(LOCAL_FILTERS):
+        x.lf[k].P[i, i] += variance
+
+
+@jit
+def leave_out(s: Any, prm: Any, fault: int, t: float) -> None:
+    """Isolate what failed, and admit what it may have spoilt."""
+    x = s.ft[0]
+    parts = parts_of(fault)
+    if prm.fault_tolerant_isolate > 0.0:
+        x.isolated |= parts
+        x.off = filters_of(x.isolated)
+        for k in range(16):
+            if parts & (1 << k):
+                x.t_isolated[k] = t
+    for i in range(3):
+        if parts & (0b111 | (0b111 << 9)):
+            doubt(s, 3 + i, TURNED * TURNED)
+        if parts & ~0b111:
+            doubt(s, 6 + i, PUSHED * PUSHED)
+    if fault in (BARO, POSITION):
+        for i in range(3):
+            doubt(s, 9 + i, LIFTED * LIFTED)
+    if fault == COMPASS:
+        for i in range(3):
+            doubt(s, 3 + i, TURNED * TURNED)
+    if fault == WIND and prm.fault_tolerant_wind > 0.0:
+        for i in range(2):
+            doubt(s, 18 + i, BLOWN * BLOWN)
+            doubt(s, 20 + i, BLOWN * BLOWN)
+
+
+@jit
+def tell(s: Any, code: Any, t: float, fault: int, candidates: int) -> None:
+    """Leave an event with what it rests on."""
+    x = s.ft[0]
+    k = x.n_findings % FINDINGS
+    f = x.finding[k]
+    for i in range(N_DETECTORS):
+        f.when[i] = x.when[i] if x.alarms & (1 << i) else 0.0
+        f.most[i] = x.most[i]
+    n = s.n_events
+    event_since(s, t, x.t_first, code, NO_SENSOR, float(k), 1.0, fault)
+    if s.n_events > n:
+        s.event[n].seen, s.event[n].candidates = x.t_first, candidates
+        x.n_findings += 1
+
+
+@jit
+def forget_alarms(x: Any) -> None:
+    """Nothing has alarmed."""
+    x.alarms, x.t_first, x.t_alarm = 0, 0.0, 0.0
+    for i in range(N_DETECTORS):
+        x.when[i], x.most[i] = 0.0, 0.0
+
+
+@jit
+def lowest(bits: int) -> int:
+    """Number of the lowest bit that is set."""
+    k = 0
+    while bits & (1 << k) == 0:
+        k += 1
+    return k
+
+
+@jit
+def complete(alarms: int) -> int:
+    """The one fault whose signature is complete, none but what it may have alarmed, and that no more alarms can turn into another; else -1."""
+    best = -1
+    for f in range(N_FAULTS):
+        if MUST[f] & ~alarms == 0 and alarms & ~(MUST[f] | MAY[f]) == 0:
+            if best >= 0:
+                return -1
+            best = f
+    if best < 0 or count(MUST[best]) < 2:
+        return -1
+    for f in range(N_FAULTS):
+        if f != best and alarms & ~(MUST[f] | MAY[f]) == 0:
+            return -1
+    return best
+
+
+@jit
+def newest(x: Any) -> float:
+    """When the last detection filter alarmed that had not before."""
+    t = x.t_first
+    for i in range(N_DETECTORS):
+        if x.alarms & (1 << i):
+            t = max(t, x.when[i])
+    return t
+
+
+@jit
+def decide(s: Any, prm: Any, t: float) -> None:
+    """After the detection filters: a verdict where it is time for one, and what was isolated comes back where it agrees again."""
+    x = s.ft[0]
+    readmit(s, prm, t)
+    if x.alarms == 0:
+        return
+    fault = complete(x.alarms)
+    if fault >= 0 and t - newest(x) < SETTLED:
+        return
+    candidates = 0
+    if fault < 0:
+        if t - x.t_first < prm.fault_tolerant_wait:
+            return
+        candidates, wrong = match(x.alarms, 0)
+        if count(candidates) == 1 and wrong <= 1:
+            fault = lowest(candidates)
+    if fault >= 0:
+        tell(s, E_ISOLATED, t, fault, 1 << fault)
+        leave_out(s, prm, fault, t)
+    else:
+        tell(s, E_UNDECIDED, t, N_FAULTS, candidates)
+    forget_alarms(x)
+    reseed(s, prm)
+
+
+@jit
+def readmit(s: Any, prm: Any, t: float) -> None:
+    """A sensor whose detection filter has been quiet for ``fault_tolerant.recover`` is heard again, its bias open; a model axis is not."""
+    x = s.ft[0]
+    if x.isolated == 0:
+        return
+    for k in range(16):
+        if x.isolated & (1 << k) == 0 or (k >= 6 and k < 12):
+            continue
+        detector = 3 + k if k < 3 else k - 3 if k < 6 else k - 6
+        if x.last[detector] > 1.0:
+            x.t_isolated[k] = t
+        elif t - x.t_isolated[k] > prm.fault_tolerant_recover:
+            x.isolated &= ~(1 << k)
+            x.off = filters_of(x.isolated)
+            x.t_first = t
+            tell(s, E_READMITTED, t, k, 1 << k)
+            x.t_first = 0.0
