@@ -33,9 +33,11 @@ _TABLE: tuple[tuple[str, str, str], ...] = (
     ("gnss.velocity", "J22 J32", "J24 J34"),
     ("barometer", "J23 J33", ""),
     ("gnss.position", "J24 J34", ""),
-    ("rotor", "J13 J14 J15", "J16 J21 J22 J23 J24 J11 J12"),
-    ("wind", "J11 J12", "J13 J22 J24"),
+    ("rotor", "J14 J15", "J13 J16 J21 J22 J23 J24 J11 J12"),
+    ("wind", "", "J11 J12 J13 J22 J24"),
 )
+#: A step of the wind shows in one of these at least, by its direction.
+AIR = constant(_BIT["J11"] | _BIT["J12"])
 FAULTS = tuple(row[0] for row in _TABLE)
 N_FAULTS = constant(len(FAULTS))
 MUST = tuple(constant(sum(_BIT[name] for name in row[1].split())) for row in _TABLE)
@@ -66,7 +68,7 @@ def match(alarms: int, blind: int) -> tuple[int, int]:
     best, least = 0, 99
     for f in range(N_FAULTS):
         wrong = count(MUST[f] & ~alarms & ~blind) + count(alarms & ~(MUST[f] | MAY[f]))
-        if MUST[f] & alarms == 0:
+        if (MUST[f] if MUST[f] != 0 else AIR) & alarms == 0:
             continue
         if wrong < least:
             best, least = 1 << f, wrong

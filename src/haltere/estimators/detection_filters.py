@@ -15,7 +15,7 @@ from haltere._jit import constant, jit
 from haltere.aids import gnss
 from haltere.aids.record import BAROMETER, C_ALTITUDE, C_HEADING, C_POS, C_VEL, GNSS_POSITION, GNSS_VELOCITY, MAGNETOMETER, R_START
 from haltere.core.rotation import Mat, Vec, dcm, mul_mat
-from haltere.estimators.local_filters import MISS_TIME, add_noise, compass_row, correct, linear_at, miss, scalar, swing_noise, unit
+from haltere.estimators.local_filters import MISS_TIME, add_noise, compass_row, correct, gust, linear_at, miss, scalar, swing_noise, unit
 from haltere.filter.update import NONE
 from haltere.filter.windows import empty, take
 from haltere.strapdown.dynamics import ATTITUDE, OWN, PLACE, SPEED, carry, move, transition, transpose
@@ -27,6 +27,8 @@ __all__ = ["detect_external", "detect_inertial", "detect_of_the_imu", "reseed", 
 FORCES, MOMENTS, BY_MODEL, BY_IMU = (constant(i) for i in (0, 3, 6, 10))
 #: The chains settle for so long after they begin [s], and the air near the ground counts for nothing [m].
 SETTLE, NEAR = 6.0, 1.5
+#: The accelerometer's bias that J11-J13 take off is as old as that, to twice that [s]: a fault shall not hide in it.
+HELD = 4.0
 #: The model's chain begins anew when its tilt is less sure than this [rad].
 LOST = math.radians(40.0)
 
@@ -39,9 +41,9 @@ def reseed(s: Any, prm: Any) -> None:
     for i in range(3):
         c.w[i], c.v[i], c.p[i], c.bm[i], c.bf[i] = x.w[i], x.v[i], x.p[i], x.bm[i], x.bf[i]
         x.axis[i, 0], x.axis[i, 1] = x.w[i] + x.lf[0].own[i], 0.0
-        sd = miss(s, 3 + i)
+        sd = miss(s, prm, 3 + i)
         x.axis_P[i, 0], x.axis_P[i, 1], x.axis_P[i, 2] = 1e-3, 0.0, sd * sd if prm.fault_tolerant_biases > 0.0 else 0.0
-        a.x[i] = x.bf[i] + x.lf[1].own[i]
+        a.x[i], x.held[0, i], x.held[1, i] = x.bf[i], x.lf[1].own[i], x.lf[1].own[i]
     for i in range(4):
         c.q[i] = x.q[i]
     for i in range(2):
@@ -58,8 +60,8 @@ def reseed(s: Any, prm: Any) -> None:
         for j in range(7):
             a.P[i, j] = 0.0
     for i in range(3):
-        sd = miss(s, i)
-        a.P[i, i] = sd * sd + x.lf[1].P[22 + i, 22 + i]
+        sd = miss(s, prm, i)
+        a.P[i, i] = sd * sd
     for i in range(4):
         for j in range(4):
             a.P[3 + i, 3 + j] = x.P[18 + i, 18 + j]
@@ -67,7 +69,7 @@ def reseed(s: Any, prm: Any) -> None:
         empty(x.fast[i])
     for i in range(len(x.slow)):
         empty(x.slow[i])
-    x.t_chain = x.t
+    x.t_chain = x.t_held = x.t
 
 
 @jit
@@ -124,7 +126,7 @@ def detect_inertial(s: Any, prm: Any, lin: Linear, C: Mat, gyro: Vec, accel: Vec
     leak = math.exp(-dt / MISS_TIME)
     r_gyro = (prm.noise_gyro * prm.noise_gyro) / dt
     for i in range(3):
-        P, sd = x.axis_P[i], miss(s, 3 + i)
+        P, sd = x.axis_P[i], miss(s, prm, 3 + i)
         w, b = x.axis[i, 0], x.axis[i, 1]
         w += dt * (turned[i] + b + lin[5][i][i] * (w - x.w[i] - x.lf[0].own[i]))
         b *= leak
@@ -138,8 +140,7 @@ def detect_inertial(s: Any, prm: Any, lin: Linear, C: Mat, gyro: Vec, accel: Vec
         P[0], P[1], P[2] = (1.0 - k0) * p00, (1.0 - k0) * p01, p11 - k1 * p01
         fast(s, prm, MOMENTS + i, e / math.sqrt(S), x.t)
     a, keep = x.air, math.exp(-dt / prm.air_gust_time)
-    wind = math.sqrt(x.steady[0] * x.steady[0] + x.steady[1] * x.steady[1])
-    gust = prm.air_gust + prm.air_turbulence * wind
+    blow = gust(s, prm)
     for i in range(3):
         a.x[i] *= leak
     for i in range(2):
@@ -154,22 +155,29 @@ def detect_inertial(s: Any, prm: Any, lin: Linear, C: Mat, gyro: Vec, accel: Vec
             for j in range(i):
                 a.P[i, j], a.P[j, i] = a.P[j, i], a.P[i, j]
     for i in range(3):
-        sd = miss(s, i)
+        sd = miss(s, prm, i)
         if prm.fault_tolerant_biases > 0.0:
-            a.P[i, i] += (1.0 - leak * leak) * (sd * sd + prm.init_accel_bias * prm.init_accel_bias)
+            a.P[i, i] += (1.0 - leak * leak) * sd * sd
         if i < 2 and prm.fault_tolerant_wind > 0.0:
-            a.P[3 + i, 3 + i] += (1.0 - keep * keep) * gust * gust
+            a.P[3 + i, 3 + i] += (1.0 - keep * keep) * blow * blow
             a.P[5 + i, 5 + i] += dt * prm.noise_wind_mean * prm.noise_wind_mean
     by_v = mul_mat(lin[2], transpose(C))
     for i in range(3):
         b = by_v[i]
-        e = accel[i] + x.bf[i] - a.x[i] - b[0] * (x.wind[0] - a.x[3]) - b[1] * (x.wind[1] - a.x[4])
+        e = accel[i] + x.bf[i] - x.held[0, i] - a.x[i] - b[0] * (x.wind[0] - a.x[3]) - b[1] * (x.wind[1] - a.x[4])
         r = prm.noise_accel * prm.noise_accel / dt + 0.25 * m.sd[i] * m.sd[i] * m.window[0] / dt
         for j in range(3):
             r += b[j] * b[j] * x.P[6 + j, 6 + j]
         H = ((0, unit(i)), (3, (-b[0], -b[1], 0.0)), NONE)
         e, S = scalar(a, H, e, r, 1e9)
+        before = x.alarms & (1 << i)
         fast(s, prm, FORCES + i, e / math.sqrt(S), x.t)
+        if before == 0 and x.alarms & (1 << i):
+            x.size[i] = abs(x.fast[i].mean[0]) * math.sqrt(S)
+    if x.t - x.t_held > HELD and x.alarms == 0:
+        x.t_held = x.t
+        for i in range(3):
+            x.held[0, i], x.held[1, i] = x.held[1, i], x.lf[1].own[i]
     for i in range(7):
         a.x[i] += a.dx[i]
         a.dx[i] = 0.0
@@ -216,7 +224,10 @@ def detect_external(s: Any, prm: Any, dt: float) -> None:
         elif m.kind == MAGNETOMETER and s.has_field == 1:
             e, h, r1 = compass_row(s, prm, C, (m.z[0], m.z[1], m.z[2]), 0.02)
             e, S = scalar(c, ((ATTITUDE, h), NONE, NONE), e, r1, 0.0 if x.isolated & (1 << 12) else prm.gate_magnetometer)
-            slow(s, prm, BY_MODEL, (e / math.sqrt(S), 0.0, 0.0), 1, m.t)
+            # alike in all samples of a while is what the chain must believe of the surroundings; a fault is more than that
+            horizontal = s.field[2] * math.cos(s.field[1])
+            white = (prm.noise_magnetometer * prm.noise_magnetometer + prm.noise_field * prm.noise_field) / (horizontal * horizontal)
+            slow(s, prm, BY_MODEL, (e / math.sqrt(S - r1 + white), 0.0, 0.0), 1, m.t)
         elif m.kind == BAROMETER:
             r1 = prm.noise_barometer * prm.noise_barometer
             e = m.z[0] - s.origin[2] + c.p[2] - c.baro

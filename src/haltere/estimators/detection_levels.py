@@ -17,7 +17,7 @@ COMPONENTS = (1, 1, 1, 1, 1, 1, 1, 3, 1, 3, 1, 3, 1, 3)
 #: Samples a second that are expected of what J21-J24 and J31-J34 hear: compass, GNSS velocity, barometer, GNSS position.
 SAMPLES = (50.0, 10.0, 25.0, 10.0)
 #: Factors for residuals that are not white and not of unit variance; of windows, and of single residuals.
-COLOUR = np.ones(14)
+COLOUR = np.array([1.2, 1.2, 1.1, 1.8, 1.8, 1.6, 0.6, 1.8, 0.6, 1.5, 1.6, 1.3, 0.6, 1.5])
 COLOUR_SNAPSHOT = np.ones(14)
 
 

@@ -11,7 +11,7 @@ from typing import Any
 
 from haltere._jit import entry, jit
 from haltere.aids.drag import density_ratio
-from haltere.aids.record import BAROMETER, GNSS_POSITION, GNSS_VELOCITY, MAGNETOMETER
+from haltere.aids.record import BAROMETER, E_FAULT, GNSS_POSITION, GNSS_VELOCITY, MAGNETOMETER
 from haltere.core.earth import STANDARD_DENSITY
 from haltere.core.rotation import Vec, dcm, mat_vec, quat_from_rotvec, quat_mul, quat_unit
 from haltere.estimators import step as ordinary
@@ -105,10 +105,16 @@ def advance(s: Any, prm: Any, rows: Any, cov: Any, aids: Any, tape: Any, stage: 
     t = m.t
     w1, f1 = (m.w[0], m.w[1], m.w[2]), (m.f[0], m.f[1], m.f[2])
     listen(s, t)
-    n, unaligned = s.n_aids, s.n_unaligned
+    n, unaligned, n_events = s.n_aids, s.n_unaligned, s.n_events
     s.n_aids = 0
     ordinary.advance(s, prm, x.nothing, x.nothing, x.heard, tape, stage)
     n_heard = s.n_aids
+    for i in range(n_events, s.n_events):  # the signatures of the IMU chain's faults, steps and ramps
+        e = s.event[i]
+        if e.code == E_FAULT and e.detail >= 0 and e.detail < 12 and x.armed == 1:
+            x.named = 1 + e.detail % 6
+            if x.alarms == 0:
+                x.t_first = max(e.seen, x.t_chain)
     s.n_aids = hand_over(s, aids, n)
     rotors_at(s, t)
     dt = t - x.t

@@ -14,6 +14,7 @@ from haltere.aids.record import E_ISOLATED, E_READMITTED, E_UNDECIDED, NO_SENSOR
 from haltere.diagnosis.truth_table import MAY, MUST, N_FAULTS, count, match
 from haltere.estimators.detection_filters import reseed
 from haltere.estimators.federated_layout import FINDINGS, LOCAL_FILTERS, N_DETECTORS
+from haltere.filter.signatures import SLOTS
 
 __all__ = ["decide"]
 
@@ -110,7 +111,7 @@ def tell(s: Any, code: Any, t: float, fault: int, candidates: int) -> None:
 @jit
 def forget_alarms(x: Any) -> None:
     """Nothing has alarmed."""
-    x.alarms, x.t_first, x.t_alarm = 0, 0.0, 0.0
+    x.alarms, x.t_first, x.t_alarm, x.named = 0, 0.0, 0.0, 0
     for i in range(N_DETECTORS):
         x.when[i], x.most[i] = 0.0, 0.0
 
@@ -152,11 +153,44 @@ def newest(x: Any) -> float:
 
 
 @jit
+def powerless(s: Any, prm: Any, t: float) -> int:
+    """Detection filters whose silence says nothing yet: those of the IMU chain, where a model's force alarms (theory-amendments.md 3).
+
+    With the signatures of `haltere.filter.signatures`, an accelerometer fault of the size b that J11-J13 saw would be found by now with
+    probability 99 % where b² D ≥ (√h + 2.33)², D the information on it. Without them nothing is known of the power.
+    """
+    x = s.ft[0]
+    if len(s.bank) == 0:
+        return 0
+    b = s.bank[0]
+    for a in range(3):
+        if x.alarms & (1 << a):
+            known = 0.0
+            for k in range(len(b.live)):
+                if b.live[k] == 1 and abs(b.onset[k] - x.when[a]) < 0.4:
+                    known = max(known, float(b.den[(3 + a) * SLOTS + k]))
+            need = math.sqrt(prm.diagnosis_threshold) + 2.33
+            if x.size[a] * x.size[a] * known < need * need:
+                return int(BY_IMU)
+    return 0
+
+
+@jit
 def decide(s: Any, prm: Any, t: float) -> None:
     """After the detection filters: a verdict where it is time for one, and what was isolated comes back where it agrees again."""
     x = s.ft[0]
     readmit(s, prm, t)
+    named = x.named - 1
+    if x.alarms == 0 and named < 0:
+        return
+    if named >= 0 and (x.alarms & (BY_MODEL | 0b111111)) & ~MUST[named] == 0:
+        tell(s, E_ISOLATED, t, named, 1 << named)
+        leave_out(s, prm, named, t)
+        forget_alarms(x)
+        reseed(s, prm)
+        return
     if x.alarms == 0:
+        x.named = 0
         return
     fault = complete(x.alarms)
     if fault >= 0 and t - newest(x) < SETTLED:
@@ -165,7 +199,10 @@ def decide(s: Any, prm: Any, t: float) -> None:
     if fault < 0:
         if t - x.t_first < prm.fault_tolerant_wait:
             return
-        candidates, wrong = match(x.alarms, 0)
+        blind = powerless(s, prm, t)
+        if blind != 0 and t - x.t_first < 2.0 * prm.fault_tolerant_wait:
+            return
+        candidates, wrong = match(x.alarms, blind)
         if count(candidates) == 1 and wrong <= 1:
             fault = lowest(candidates)
     if fault >= 0:

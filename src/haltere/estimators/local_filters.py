@@ -42,7 +42,7 @@ __all__ = ["add_noise", "alive", "compass_row", "evaluate", "fuse_sensors", "fus
 #: How long what the model misses of force and moment lasts [s], and least 1 sigma of it [m/s^2, rad/s^2].
 MISS_TIME = 1.0
 #: What an angular acceleration is off by, as a part of it.
-RELATIVE = 0.1
+RELATIVE = 0.3
 #: Shares of the fused information.
 SHARES = (0.5, 0.4, 0.034, 0.033, 0.033)
 FORCE_LEAST, MOMENT_LEAST = 0.05, 0.05
@@ -101,9 +101,23 @@ def evaluate(s: Any, prm: Any) -> None:
 
 
 @jit
-def miss(s: Any, axis: int) -> float:
-    """1 sigma of what the model misses for a while, by axis hx hy t r p q [m/s^2, rad/s^2]."""
-    return max(s.model[0].slow[axis], FORCE_LEAST if axis < 3 else MOMENT_LEAST)
+def miss(s: Any, prm: Any, axis: int) -> float:
+    """1 sigma of what the model misses for a while, by axis hx hy t r p q [m/s^2, rad/s^2]; of thrust also by gusts up and down."""
+    m = s.model[0]
+    out = max(m.slow[axis], FORCE_LEAST if axis < 3 else MOMENT_LEAST)
+    if axis == 2 and prm.fault_tolerant_wind > 0.0:
+        total = 0.0
+        for i in range(len(s.speed)):
+            total += s.speed[i]
+        return math.hypot(out, 0.5 * (gust(s, prm) - prm.air_gust) * m.k[2, 2] * total)
+    return out
+
+
+@jit
+def gust(s: Any, prm: Any) -> float:
+    """1 sigma of gusts along an axis [m/s], see `haltere.strapdown.propagate.blow`."""
+    x = s.ft[0]
+    return prm.air_gust + prm.air_turbulence * math.sqrt(x.steady[0] * x.steady[0] + x.steady[1] * x.steady[1])
 
 
 @jit
@@ -115,6 +129,11 @@ def swing_noise(s: Any, a: int) -> float:
     x, m = s.ft[0], s.model[0]
     sd = m.sd[3 + a]
     part = RELATIVE * (x.a[a] + x.bm[a])
+    if a == 2:
+        h = 0.0
+        for i in range(len(s.speed)):
+            h += m.yaw[i] * s.spin_up[i]
+        part = math.hypot(part, RELATIVE * m.k[5, 3] * h)
     return (sd * sd + part * part) * m.window[1]
 
 
@@ -123,10 +142,9 @@ def add_noise(s: Any, prm: Any, P: Any, C: Mat, dt: float, share: float) -> None
     """Noise of the process over one interval, ``share`` (1/β) times: what the model misses, gusts, walks of sensors' biases not."""
     m, x = s.model[0], s.ft[0]
     k = share * dt
-    wind = math.sqrt(x.steady[0] * x.steady[0] + x.steady[1] * x.steady[1])
-    gust = prm.air_gust + prm.air_turbulence * wind
+    blow = gust(s, prm)
     for i in range(3):
-        moment, force = miss(s, 3 + i), miss(s, i)
+        moment, force = miss(s, prm, 3 + i), miss(s, prm, i)
         if x.isolated & (1 << (6 + i)):
             force = FORCE_FREE
         if x.isolated & (1 << (9 + i)):
@@ -143,7 +161,7 @@ def add_noise(s: Any, prm: Any, P: Any, C: Mat, dt: float, share: float) -> None
         P[6 + i, 6 + i] += k * white
     if prm.fault_tolerant_wind > 0.0:
         for i in range(2):
-            P[18 + i, 18 + i] += k * 2.0 * gust * gust / prm.air_gust_time
+            P[18 + i, 18 + i] += k * 2.0 * blow * blow / prm.air_gust_time
             P[20 + i, 20 + i] += k * prm.noise_wind_mean * prm.noise_wind_mean
 
 

@@ -27,8 +27,8 @@ def begin(s: Any, prm: Any, t: float) -> None:
         x.w[i], x.v[i], x.p[i] = s.w_raw[i] - s.bg[i], s.v[i], s.p[i]
         x.bm[i], x.bf[i], x.a[i] = 0.0, 0.0, 0.0
         x.P[i, i] = RATE_SD * RATE_SD
-        x.P[12 + i, 12 + i] = miss(s, 3 + i) ** 2
-        x.P[15 + i, 15 + i] = miss(s, i) ** 2
+        x.P[12 + i, 12 + i] = miss(s, prm, 3 + i) ** 2
+        x.P[15 + i, 15 + i] = miss(s, prm, i) ** 2
     for i in range(9):
         for j in range(9):
             x.P[3 + i, 3 + j] = s.P[i, j]

@@ -364,7 +364,7 @@ _NO_AIR: dict[str, Value] = {"aid.drag": "off", "aid.airdata": "off", "aid.vanes
 #: What an estimator sets differently from the defaults above.
 _OVERRIDES: dict[str, dict[str, Value]] = {
     "navigator": {},
-    "fault-tolerant": {**_NO_AIR, "diagnosis.inertial": "off"},
+    "fault-tolerant": {**_NO_AIR, "diagnosis.inertial": "on"},
     "ahrs": {
         "aid.gnss": "off", "aid.barometer": "off", "aid.fake_velocity": "on", "aid.fake_position": "off", "baro.offset": "off",
         "diagnosis.inertial": "off",
