@@ -118,7 +118,7 @@ def run(
     if model is None and getattr(specification, "REQUIRES_VEHICLE", False):
         raise UsageError(
             "a vehicle file with [lumped]", "none", f"run of {estimator}",
-            "it predicts motion from rotor speeds: haltere identify LOG... --out vehicle.toml makes the file, --vehicle vehicle.toml gives it",
+            "it predicts motion from rotor speeds: haltere identify LOG... --out vehicle.toml makes it, --vehicle vehicle.toml gives it",
         )  # fmt: skip
     flight = correct(flight, asked.values)
     blind = flight.without("onboard", "truth")

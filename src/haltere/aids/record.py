@@ -50,11 +50,11 @@ R_NONE, R_INNOVATION, R_TIMEOUT, R_START, R_STRENGTH, R_DIP, R_HORIZONTAL, R_ALI
 )
 R_ACCELERATION = constant(10)
 
-#: "fault", "suspect" and "over" are findings of `haltere.diagnosis`: a fault that is named, one of several, and the end of one; the last three
-#: are verdicts of `fault-tolerant`: named and left out, one of several, heard again.
+#: "fault", "suspect" and "over" are findings of `haltere.diagnosis`: a fault that is named, one of several, and the end of one; the last
+#: three are verdicts of `fault-tolerant`: named and left out, one of several, heard again.
 EVENTS = (
-    "aligned", "reset", "diverged", "realigned", "gap", "recovered", "timeout", "disturb", "fault", "suspect", "over", "isolated", "undecided",
-    "readmitted",
+    "aligned", "reset", "diverged", "realigned", "gap", "recovered", "timeout", "disturb", "fault", "suspect", "over",
+    "isolated", "undecided", "readmitted",
 )  # fmt: skip
 E_ALIGNED, E_RESET, E_DIVERGED, E_REALIGNED, E_GAP, E_RECOVERED, E_TIMEOUT, E_DISTURBED, E_FAULT, E_SUSPECT, E_OVER = (
     constant(i) for i in range(11)

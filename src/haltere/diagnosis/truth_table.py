@@ -1,4 +1,4 @@
-"""Source F's decision: which fault each pattern of alarms of the detection filters stands for (theory.md §5.5, as amended). Data and a match.
+"""Source F's decision: what fault each pattern of alarms of the detection filters stands for (theory.md §5.5, as amended), as data.
 
 A fault's signature says of every detection filter that it must alarm, may, or must not. What matches is named; where several do, the set
 is returned; where none does, the nearest with one contradiction. Whether silence counts is for the caller to say: a filter without power
@@ -17,17 +17,17 @@ _BIT = {name: 1 << i for i, name in enumerate(DETECTORS)}
 
 #: Fault, what it isolates, must, may (theory.md §5.5: ● and ○; J24 and J34 of theory-amendments.md 10 may follow what moves position).
 _TABLE: tuple[tuple[str, str, str], ...] = (
-    ("gyro.x", "J14 J32", "J31 J33 J34"),
-    ("gyro.y", "J15 J32", "J31 J33 J34"),
-    ("gyro.z", "J16 J31", "J32 J34"),
+    ("gyro.x", "J32", "J14 J31 J33 J34"),
+    ("gyro.y", "J32", "J15 J31 J33 J34"),
+    ("gyro.z", "J31", "J16 J32 J34"),
     ("accel.x", "J11 J32", "J33 J34"),
     ("accel.y", "J12 J32", "J33 J34"),
     ("accel.z", "J13 J33", "J32 J34"),
     ("model.hx", "J11", "J22 J24"),
     ("model.hy", "J12", "J22 J24"),
     ("model.t", "J13", "J22 J23 J24"),
-    ("model.r", "J14 J22", "J21 J23 J24"),
-    ("model.p", "J15 J22", "J21 J23 J24"),
+    ("model.r", "J14 J22", "J11 J12 J21 J23 J24"),
+    ("model.p", "J15 J22", "J11 J12 J21 J23 J24"),
     ("model.q", "J16 J21", "J22 J23 J24"),
     ("magnetometer", "J21 J31", ""),
     ("gnss.velocity", "J22 J32", "J24 J34"),

@@ -29,6 +29,8 @@ FORCES, MOMENTS, BY_MODEL, BY_IMU = (constant(i) for i in (0, 3, 6, 10))
 SETTLE, NEAR = 6.0, 1.5
 #: The accelerometer's bias that J11-J13 take off is as old as that, to twice that [s]: a fault shall not hide in it.
 HELD = 4.0
+#: The model's chain believes the surroundings' field to be the same in so many samples.
+HEADING_SLOW = 10.0
 #: The model's chain begins anew when its tilt is less sure than this [rad].
 LOST = math.radians(40.0)
 
@@ -222,11 +224,11 @@ def detect_external(s: Any, prm: Any, dt: float) -> None:
                     d += 1
             slow(s, prm, BY_MODEL + (3 if place else 1), (z2, z1, z0), d, m.t)
         elif m.kind == MAGNETOMETER and s.has_field == 1:
-            e, h, r1 = compass_row(s, prm, C, (m.z[0], m.z[1], m.z[2]), 0.02)
-            e, S = scalar(c, ((ATTITUDE, h), NONE, NONE), e, r1, 0.0 if x.isolated & (1 << 12) else prm.gate_magnetometer)
-            # alike in all samples of a while is what the chain must believe of the surroundings; a fault is more than that
+            # slow to follow, so that the chain does not take a compass that has turned for a turn of the vehicle; judged sample by sample
+            e, h, r1 = compass_row(s, prm, C, (m.z[0], m.z[1], m.z[2]), prm.noise_field_time / HEADING_SLOW)
             horizontal = s.field[2] * math.cos(s.field[1])
             white = (prm.noise_magnetometer * prm.noise_magnetometer + prm.noise_field * prm.noise_field) / (horizontal * horizontal)
+            e, S = scalar(c, ((ATTITUDE, h), NONE, NONE), e, r1, 0.0 if x.isolated & (1 << 12) else prm.gate_magnetometer)
             slow(s, prm, BY_MODEL, (e / math.sqrt(S - r1 + white), 0.0, 0.0), 1, m.t)
         elif m.kind == BAROMETER:
             r1 = prm.noise_barometer * prm.noise_barometer

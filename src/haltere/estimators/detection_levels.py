@@ -1,4 +1,4 @@
-"""Levels of the detection filters of `fault-tolerant`, from a wanted rate of false alarms (theory-amendments.md 5). It looks at no flight."""
+"""Levels of the detection filters of `fault-tolerant` from a wanted rate of false alarms (theory-amendments.md 5)."""
 
 from __future__ import annotations
 
@@ -16,9 +16,12 @@ FloatArray = NDArray[np.float64]
 COMPONENTS = (1, 1, 1, 1, 1, 1, 1, 3, 1, 3, 1, 3, 1, 3)
 #: Samples a second that are expected of what J21-J24 and J31-J34 hear: compass, GNSS velocity, barometer, GNSS position.
 SAMPLES = (50.0, 10.0, 25.0, 10.0)
-#: Factors for residuals that are not white and not of unit variance; of windows, and of single residuals.
-COLOUR = np.array([1.2, 1.2, 1.1, 1.8, 1.8, 1.6, 0.6, 1.8, 0.6, 1.5, 1.6, 1.3, 0.6, 1.5])
-COLOUR_SNAPSHOT = np.ones(14)
+#: Factors for residuals that are not white and not of unit variance: the largest statistic of a fault-free flight over what a white one
+#: has, in 80 simulated flights of 90 s (seeds 7001 to 7008; hover, lissajous, box, figure-eight, tour; still air, and 4.5 m/s with gusts of
+#: 0.8 m/s; vehicle identified from three others). The hardest mission in wind is left out: it is beyond what the vehicle was identified on.
+COLOUR = np.array([1.3, 1.3, 2.9, 1.8, 1.8, 1.9, 1.8, 2.4, 0.6, 1.5, 2.4, 1.5, 0.6, 1.5])
+#: The same of single residuals.
+COLOUR_SNAPSHOT = np.array([1.3, 1.3, 1.1, 1.1, 1.1, 1.1, 1.2, 1.5, 0.5, 1.4, 0.5, 1.3, 0.5, 1.4])
 
 
 def detection_levels(config: Config) -> tuple[FloatArray, FloatArray]:

@@ -1,4 +1,4 @@
-"""What `fault-tolerant` remembers beside an ordinary filter, as record types: fused state, local filters, detection filters. No arithmetic."""
+"""What `fault-tolerant` remembers beside an ordinary filter, as record types: fused state, local filters, detectors. No arithmetic."""
 
 from __future__ import annotations
 
@@ -34,7 +34,8 @@ def _record(*fields: tuple[object, ...]) -> np.dtype[np.void]:
 
 #: See `haltere.strapdown.dynamics`.
 _NOMINAL: tuple[tuple[object, ...], ...] = (
-    ("w", "f8", 3), ("q", "f8", 4), ("v", "f8", 3), ("p", "f8", 3), ("bm", "f8", 3), ("bf", "f8", 3), ("wind", "f8", 2), ("steady", "f8", 2),
+    ("w", "f8", 3), ("q", "f8", 4), ("v", "f8", 3), ("p", "f8", 3), ("bm", "f8", 3), ("bf", "f8", 3), ("wind", "f8", 2),
+    ("steady", "f8", 2),
 )  # fmt: skip
 _UPDATED: tuple[tuple[object, ...], ...] = (("P", "f8", (25, 25)), ("dx", "f8", 25), ("u", "f8", 25), ("k", "f8", 25))
 #: A local filter: its correction ``dx`` is about the fused nominal state; its own states are a sensor's bias.

@@ -91,10 +91,10 @@ def in_the_air(s: Any, prm: Any, t: float) -> bool:
     if thrust > LIGHT * s.gravity:
         x.t_light = t
     if x.on == 1:
-        return t - x.t_light < LIGHT_TIME
+        return bool(t - x.t_light < LIGHT_TIME)
     if t - x.t_light > LIGHT_TIME:
         x.ground = s.p[2]
-    return t - x.t_heavy > HEAVY_TIME
+    return bool(t - x.t_heavy > HEAVY_TIME)
 
 
 @jit

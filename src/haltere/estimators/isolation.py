@@ -127,7 +127,7 @@ def lowest(bits: int) -> int:
 
 @jit
 def complete(alarms: int) -> int:
-    """The one fault whose signature is complete, none but what it may have alarmed, and that no more alarms can turn into another; else -1."""
+    """The one fault whose signature is complete, with none but what may alarm, and that no more alarms can turn into another; else -1."""
     best = -1
     for f in range(N_FAULTS):
         if MUST[f] & ~alarms == 0 and alarms & ~(MUST[f] | MAY[f]) == 0:
@@ -145,7 +145,7 @@ def complete(alarms: int) -> int:
 @jit
 def newest(x: Any) -> float:
     """When the last detection filter alarmed that had not before."""
-    t = x.t_first
+    t = float(x.t_first)
     for i in range(N_DETECTORS):
         if x.alarms & (1 << i):
             t = max(t, x.when[i])
@@ -203,6 +203,8 @@ def decide(s: Any, prm: Any, t: float) -> None:
         if blind != 0 and t - x.t_first < 2.0 * prm.fault_tolerant_wait:
             return
         candidates, wrong = match(x.alarms, blind)
+        if count(candidates) > 1 and len(s.bank) > 0 and t - x.t_first < 2.0 * prm.fault_tolerant_wait and candidates & 0b111111:
+            return  # the IMU chain's signatures may yet tell them apart
         if count(candidates) == 1 and wrong <= 1:
             fault = lowest(candidates)
     if fault >= 0:
@@ -210,6 +212,8 @@ def decide(s: Any, prm: Any, t: float) -> None:
         leave_out(s, prm, fault, t)
     else:
         tell(s, E_UNDECIDED, t, N_FAULTS, candidates)
+        if candidates & (1 << WIND):
+            leave_out(s, prm, WIND, t)  # nothing is left out for that
     forget_alarms(x)
     reseed(s, prm)
 

@@ -59,7 +59,7 @@ def share_of(x: Any, i: int) -> float:
             total += SHARES[k]
             if k == i:
                 own = SHARES[k]
-    return own / total
+    return float(own / total)
 
 
 @jit
@@ -71,7 +71,7 @@ def unit(a: int) -> Vec:
 @jit
 def alive(m: Any) -> bool:
     """Whether a local filter has anything left to hear."""
-    return m.axes != 0
+    return bool(m.axes != 0)
 
 
 @jit
@@ -109,15 +109,15 @@ def miss(s: Any, prm: Any, axis: int) -> float:
         total = 0.0
         for i in range(len(s.speed)):
             total += s.speed[i]
-        return math.hypot(out, 0.5 * (gust(s, prm) - prm.air_gust) * m.k[2, 2] * total)
-    return out
+        out = math.hypot(out, 0.5 * (gust(s, prm) - prm.air_gust) * m.k[2, 2] * total)
+    return float(out)
 
 
 @jit
 def gust(s: Any, prm: Any) -> float:
     """1 sigma of gusts along an axis [m/s], see `haltere.strapdown.propagate.blow`."""
     x = s.ft[0]
-    return prm.air_gust + prm.air_turbulence * math.sqrt(x.steady[0] * x.steady[0] + x.steady[1] * x.steady[1])
+    return float(prm.air_gust + prm.air_turbulence * math.sqrt(x.steady[0] * x.steady[0] + x.steady[1] * x.steady[1]))
 
 
 @jit
@@ -134,7 +134,7 @@ def swing_noise(s: Any, a: int) -> float:
         for i in range(len(s.speed)):
             h += m.yaw[i] * s.spin_up[i]
         part = math.hypot(part, RELATIVE * m.k[5, 3] * h)
-    return (sd * sd + part * part) * m.window[1]
+    return float((sd * sd + part * part) * m.window[1])
 
 
 @jit

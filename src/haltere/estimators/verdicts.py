@@ -50,9 +50,10 @@ def verdict(kind: str, record: np.void, S: NDArray[np.void], events: list[dict[s
         if len(heads) == 1:
             sensor = _parts(candidates[0])[0]
         evidence += f": {'fits ' + ', '.join(candidates) if candidates else 'no signature'}; nothing was left out"
+    word = "suspect" if kind == "undecided" else "step" if sensor == "wind" else "bias"
     events.append(
         {
-            "sensor": sensor, "axis": axis, "kind": "bias" if kind == "isolated" and sensor != "wind" else "suspect" if kind != "isolated" else "step",
+            "sensor": sensor, "axis": axis, "kind": word,
             "t_onset": float(record["onset"]), "t_detected": float(record["seen"]), "t_isolated": t if kind == "isolated" else None,
             "t_recovered": None, "candidates": candidates, "statistic": float(max(most)), "threshold": 1.0, "evidence": evidence,
         }
