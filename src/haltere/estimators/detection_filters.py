@@ -15,7 +15,19 @@ from haltere._jit import constant, jit
 from haltere.aids import gnss
 from haltere.aids.record import BAROMETER, C_ALTITUDE, C_HEADING, C_POS, C_VEL, GNSS_POSITION, GNSS_VELOCITY, MAGNETOMETER, R_START
 from haltere.core.rotation import Mat, Vec, dcm, mul_mat
-from haltere.estimators.local_filters import MISS_TIME, add_noise, compass_row, correct, gust, linear_at, miss, scalar, swing_noise, unit
+from haltere.estimators.local_filters import (
+    MISS_TIME,
+    add_noise,
+    compass_row,
+    correct,
+    gust,
+    left_over,
+    linear_at,
+    miss,
+    scalar,
+    swing_noise,
+    unit,
+)
 from haltere.filter.update import NONE
 from haltere.filter.windows import empty, take
 from haltere.strapdown.dynamics import ATTITUDE, OWN, PLACE, SPEED, carry, move, transition, transpose
@@ -29,8 +41,6 @@ FORCES, MOMENTS, BY_MODEL, BY_IMU = (constant(i) for i in (0, 3, 6, 10))
 SETTLE, NEAR = 6.0, 1.5
 #: The accelerometer's bias that J11-J13 take off is as old as that, to twice that [s]: a fault shall not hide in it.
 HELD = 4.0
-#: The model's chain believes the surroundings' field to be the same in so many samples.
-HEADING_SLOW = 10.0
 #: The model's chain begins anew when its tilt is less sure than this [rad].
 LOST = math.radians(40.0)
 
@@ -132,7 +142,7 @@ def detect_inertial(s: Any, prm: Any, lin: Linear, C: Mat, gyro: Vec, accel: Vec
         w, b = x.axis[i, 0], x.axis[i, 1]
         w += dt * (turned[i] + b + lin[5][i][i] * (w - x.w[i] - x.lf[0].own[i]))
         b *= leak
-        p00 = P[0] + dt * (2.0 * P[1] + dt * P[2]) + dt * swing_noise(s, i)
+        p00 = P[0] + dt * (2.0 * P[1] + dt * P[2]) + dt * swing_noise(s, prm, i)
         p01, p11 = leak * (P[1] + dt * P[2]), leak * leak * P[2]
         if prm.fault_tolerant_biases > 0.0:
             p11 += (1.0 - leak * leak) * sd * sd
@@ -167,7 +177,7 @@ def detect_inertial(s: Any, prm: Any, lin: Linear, C: Mat, gyro: Vec, accel: Vec
     for i in range(3):
         b = by_v[i]
         e = accel[i] + x.bf[i] - x.held[0, i] - a.x[i] - b[0] * (x.wind[0] - a.x[3]) - b[1] * (x.wind[1] - a.x[4])
-        r = prm.noise_accel * prm.noise_accel / dt + 0.25 * m.sd[i] * m.sd[i] * m.window[0] / dt
+        r = (prm.noise_accel * prm.noise_accel + left_over(s, prm, i) * m.window[0]) / dt
         for j in range(3):
             r += b[j] * b[j] * x.P[6 + j, 6 + j]
         H = ((0, unit(i)), (3, (-b[0], -b[1], 0.0)), NONE)
@@ -224,12 +234,10 @@ def detect_external(s: Any, prm: Any, dt: float) -> None:
                     d += 1
             slow(s, prm, BY_MODEL + (3 if place else 1), (z2, z1, z0), d, m.t)
         elif m.kind == MAGNETOMETER and s.has_field == 1:
-            # slow to follow, so that the chain does not take a compass that has turned for a turn of the vehicle; judged sample by sample
-            e, h, r1 = compass_row(s, prm, C, (m.z[0], m.z[1], m.z[2]), prm.noise_field_time / HEADING_SLOW)
-            horizontal = s.field[2] * math.cos(s.field[1])
-            white = (prm.noise_magnetometer * prm.noise_magnetometer + prm.noise_field * prm.noise_field) / (horizontal * horizontal)
+            # each sample for itself: innovations must be white here, and what surroundings do to all of them is a factor on the level
+            e, h, r1 = compass_row(s, prm, C, (m.z[0], m.z[1], m.z[2]), prm.noise_field_time)
             e, S = scalar(c, ((ATTITUDE, h), NONE, NONE), e, r1, 0.0 if x.isolated & (1 << 12) else prm.gate_magnetometer)
-            slow(s, prm, BY_MODEL, (e / math.sqrt(S - r1 + white), 0.0, 0.0), 1, m.t)
+            slow(s, prm, BY_MODEL, (e / math.sqrt(S), 0.0, 0.0), 1, m.t)
         elif m.kind == BAROMETER:
             r1 = prm.noise_barometer * prm.noise_barometer
             e = m.z[0] - s.origin[2] + c.p[2] - c.baro

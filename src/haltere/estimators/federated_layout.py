@@ -97,6 +97,7 @@ def federated() -> np.dtype[np.void]:
         ("size", "f8", 3),  # force that J11-J13 missed when they first alarmed [m/s^2]
         ("held", "f8", (2, 3)),  # accelerometer bias of some seconds ago, and of later
         ("t_held", "f8"),
+        ("t_compass", "f8"),  # when the compass watch last found another field
         ("named", "i8"),  # fault that the signatures of the IMU chain name, plus one
         ("t_first", "f8"),
         ("t_alarm", "f8"),

@@ -10,8 +10,9 @@ import math
 from typing import Any
 
 from haltere._jit import entry, jit
+from haltere.aids.compass import OUT_FIELD
 from haltere.aids.drag import density_ratio
-from haltere.aids.record import BAROMETER, E_FAULT, GNSS_POSITION, GNSS_VELOCITY, MAGNETOMETER
+from haltere.aids.record import BAROMETER, E_DISTURBED, E_FAULT, GNSS_POSITION, GNSS_VELOCITY, MAGNETOMETER
 from haltere.core.earth import STANDARD_DENSITY
 from haltere.core.rotation import Vec, dcm, mat_vec, quat_from_rotvec, quat_mul, quat_unit
 from haltere.estimators import step as ordinary
@@ -111,6 +112,8 @@ def advance(s: Any, prm: Any, rows: Any, cov: Any, aids: Any, tape: Any, stage: 
     n_heard = s.n_aids
     for i in range(n_events, s.n_events):  # the signatures of the IMU chain's faults, steps and ramps
         e = s.event[i]
+        if e.code == E_DISTURBED and e.detail == OUT_FIELD:
+            x.t_compass = t
         if e.code == E_FAULT and e.detail >= 0 and e.detail < 12 and x.armed == 1:
             x.named = 1 + e.detail % 6
             if x.alarms == 0:

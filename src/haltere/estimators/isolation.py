@@ -24,6 +24,9 @@ GYRO, ACCEL, MODEL, COMPASS, VELOCITY, BARO, POSITION, ROTOR, WIND = (constant(i
 SETTLED = 0.4
 #: What a fault may have done to the fused state until it was named, 1 sigma: attitude [rad], velocity [m/s], height [m], wind [m/s].
 TURNED, PUSHED, LIFTED, BLOWN = math.radians(3.0), 0.5, 1.0, 4.0
+#: Gyro z and compass are told apart within so many times ``fault_tolerant.wait``.
+DRIFT = 1.6
+J16, J31 = constant(1 << 5), constant(1 << 10)
 #: Bits of the detection filters that hear a sensor: of the IMU chain, of the model's chain, of both by what they hear.
 BY_IMU, BY_MODEL = constant(0b1111 << 10), constant(0b1111 << 6)
 
@@ -196,7 +199,16 @@ def decide(s: Any, prm: Any, t: float) -> None:
     if fault >= 0 and t - newest(x) < SETTLED:
         return
     candidates = 0
-    if fault < 0:
+    if fault < 0 and len(s.bank) > 0 and x.alarms & ~(MUST[GYRO + 2] | MAY[GYRO + 2]) == 0 and x.alarms & J31:
+        # a gyro that drifts, or a compass: the model alone holds heading too badly for J21 to tell. The signatures do, or a field of another size
+        if t - x.t_first < DRIFT * prm.fault_tolerant_wait:
+            return
+        candidates = (1 << (GYRO + 2)) | (1 << COMPASS)
+        if x.alarms & J16:
+            fault = GYRO + 2
+        elif x.t_compass > x.t_first - 1.0:
+            fault = COMPASS
+    elif fault < 0:
         if t - x.t_first < prm.fault_tolerant_wait:
             return
         blind = powerless(s, prm, t)

@@ -41,6 +41,8 @@ __all__ = ["add_noise", "alive", "compass_row", "evaluate", "fuse_sensors", "fus
 
 #: How long what the model misses of force and moment lasts [s], and least 1 sigma of it [m/s^2, rad/s^2].
 MISS_TIME = 1.0
+#: Of what identification left, at least this part is the model's.
+LEAST_LEFT = 0.1
 #: What an angular acceleration is off by, as a part of it.
 RELATIVE = 0.3
 #: Shares of the fused information.
@@ -121,20 +123,28 @@ def gust(s: Any, prm: Any) -> float:
 
 
 @jit
-def swing_noise(s: Any, a: int) -> float:
+def left_over(s: Any, prm: Any, axis: int) -> float:
+    """Variance of what identification left in its windows, without the noise of its sensors: means, and changes of means over a fifth."""
+    m = s.model[0]
+    total, w = m.sd[axis] * m.sd[axis], m.window[0 if axis < 3 else 1]
+    own = prm.noise_accel * prm.noise_accel / w if axis < 3 else 10.0 * prm.noise_gyro * prm.noise_gyro / (w * w * w)
+    return float(max(total - own, LEAST_LEFT * total))
+
+
+@jit
+def swing_noise(s: Any, prm: Any, a: int) -> float:
     """Spectral density of what the model's angular acceleration about an axis misses for a moment [rad^2/s^3].
 
     What identification left in its windows, and a part of the angular acceleration itself: rotor speeds come late and are not quite right.
     """
     x, m = s.ft[0], s.model[0]
-    sd = m.sd[3 + a]
     part = RELATIVE * (x.a[a] + x.bm[a])
     if a == 2:
         h = 0.0
         for i in range(len(s.speed)):
             h += m.yaw[i] * s.spin_up[i]
         part = math.hypot(part, RELATIVE * m.k[5, 3] * h)
-    return float((sd * sd + part * part) * m.window[1])
+    return float((left_over(s, prm, 3 + a) + part * part) * m.window[1])
 
 
 @jit
@@ -149,14 +159,14 @@ def add_noise(s: Any, prm: Any, P: Any, C: Mat, dt: float, share: float) -> None
             force = FORCE_FREE
         if x.isolated & (1 << (9 + i)):
             moment = MOMENT_FREE
-        P[i, i] += k * swing_noise(s, i)
+        P[i, i] += k * swing_noise(s, prm, i)
         P[3 + i, 3 + i] += k * 1e-9
         P[9 + i, 9 + i] += k * 1e-6
         P[12 + i, 12 + i] += k * 2.0 * moment * moment / MISS_TIME
         P[15 + i, 15 + i] += k * 2.0 * force * force / MISS_TIME
     white = 0.0
     for i in range(3):
-        white = max(white, 0.25 * m.sd[i] * m.sd[i] * m.window[0])
+        white = max(white, left_over(s, prm, i) * m.window[0])
     for i in range(3):
         P[6 + i, 6 + i] += k * white
     if prm.fault_tolerant_wind > 0.0:
@@ -221,8 +231,7 @@ def fuse_inertial(s: Any, prm: Any, lin: Linear, C: Mat, v: Vec, gyro: Vec, acce
     by_theta, by_v = mul_mat(D_a, cross_matrix(v)), mul_mat(D_a, transpose(C))
     for a in range(3):
         if h.axes & (1 << a):
-            m = s.model[0]
-            r = prm.noise_accel * prm.noise_accel / dt + 0.25 * m.sd[a] * m.sd[a] * m.window[0] / dt
+            r = (prm.noise_accel * prm.noise_accel + left_over(s, prm, a) * s.model[0].window[0]) / dt
             b = by_v[a]
             H6 = (
                 (RATE, D_w[a]), (ATTITUDE, by_theta[a]), (SPEED, b), (FORCE, unit(a)), (WIND, (-b[0], -b[1], 0.0)), (OWN, unit(a)),

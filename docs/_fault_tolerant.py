@@ -1,0 +1,179 @@
+"""Experiment of ``fault-tolerant``: verdicts on faults, false alarms, and navigation without what was isolated, on simulated flights.
+
+``python docs/_fault_tolerant.py --out docs/_data/fault_tolerant.json`` makes the tables of the page. The vehicle's model is identified on
+three flights (seeds 901 to 903) that nothing else is made of; levels of the detection filters were set on seeds 7001 to 7008; faults are
+put into flights of seeds from 50000, navigation is scored on seeds from 51000, false alarms on seeds from 60000.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+import haltere
+from haltere.flight.log import FlightLog
+from haltere.flight.vehicle import Vehicle, load_vehicle
+from haltere.identify.vehicle import identify_vehicle
+from haltere.metrics.detection import poisson_interval
+from haltere.simulate import Scenario, simulate
+
+SENSORS = {"imu": {"rate": 500.0}, "rotors": {"rate": 100.0}}
+WINDS: dict[str, dict[str, float]] = {"still": {}, "steady": {"n": 4.0, "e": 2.0}, "gusts": {"n": 4.0, "e": 2.0, "gust": 0.8}}
+START = 25.0
+#: Fault, and what may be said of it: theory.md §5.5 as amended has the second set not isolable at one heading.
+FAULTS: dict[str, tuple[str, tuple[tuple[str, ...], ...]]] = {
+    "gyro.x": ("gyro.x:bias=3deg/s", (("gyro.x",),)),
+    "gyro.y": ("gyro.y:bias=3deg/s", (("gyro.y",),)),
+    "gyro.z": ("gyro.z:bias=6deg/s", (("gyro.z",),)),
+    "accel.x": ("accel.x:bias=0.8m/s2", (("accel.x",),)),
+    "accel.y": ("accel.y:bias=0.8m/s2", (("accel.y",),)),
+    "accel.z": ("accel.z:bias=0.8m/s2", (("accel.z",),)),
+    "model.hx": ("model.hx:bias=0.8m/s2", (("model.hx",), ("model.hx", "wind"))),
+    "model.hy": ("model.hy:bias=0.8m/s2", (("model.hy",), ("model.hy", "wind"))),
+    "model.t": ("model.t:bias=0.8m/s2", (("model.t",),)),
+    "model.r": ("model.r:bias=3rad/s2", (("model.r",),)),
+    "model.p": ("model.p:bias=3rad/s2", (("model.p",),)),
+    "model.q": ("model.q:bias=1.5rad/s2", (("model.q",),)),
+    "magnetometer": ("magnetometer:disturb=0.35", (("magnetometer",),)),
+    "gnss": ("gnss.n:bias=1.5m/s", (("gnss.velocity",), ("gnss.n",))),
+    "barometer": ("barometer:bias=3m", (("barometer",),)),
+    "rotor": ("rotor.2:thrust=0.85", (("rotor",),)),
+    "wind": ("wind.n:step=4m/s", (("wind",), ("model.hx", "wind"), ("model.hy", "wind"))),
+}
+#: Left out, as theory.md §5.8 has it.
+WITHOUT: dict[str, dict[str, str]] = {
+    "none": {},
+    "accel xyz": {"exclude.accel": "xyz@20-80"},
+    "gyro z": {"exclude.gyro": "z@20-80"},
+    "gyro x": {"exclude.gyro": "x@20-80"},
+    "gyro xyz": {"exclude.gyro": "xyz@20-80"},
+    "whole IMU": {"exclude.gyro": "xyz@20-80", "exclude.accel": "xyz@20-80"},
+}
+VERDICTS = ("bias", "suspect", "step")
+
+
+def flight(seed: int, mission: str, wind: str, duration: float, fault: tuple[str, ...] = (), scale: float = 0.6) -> FlightLog:
+    """A simulated flight of the Hummingbird with rotor speeds."""
+    return simulate(Scenario(mission=mission, duration=duration, seed=seed, wind=WINDS[wind], fault=fault, scale=scale, sensors=SENSORS))
+
+
+def vehicle() -> Vehicle:
+    """What three other flights tell of it."""
+    missions = ("lissajous", "box", "figure-eight")
+    return identify_vehicle([flight(901 + k, m, "still", 90.0, scale=1.0) for k, m in enumerate(missions)]).as_vehicle()
+
+
+def verdict(log: FlightLog, of: Vehicle, preset: str) -> dict[str, Any]:
+    """The first verdict after the fault, and whether there was one before."""
+    events = [e for e in haltere.run(log, "fault-tolerant", preset=preset, vehicle=of, scored=False).events if e["kind"] in VERDICTS]
+    later = [e for e in events if e["t_onset"] > START - 1.0]
+    out: dict[str, Any] = {"before": len(events) - len(later), "said": None, "detected": None, "isolated": None}
+    if later:
+        e = later[0]
+        out |= {"said": sorted(e["candidates"]), "detected": e["t_detected"] - START}
+        if e["t_isolated"] is not None:
+            out["isolated"] = e["t_isolated"] - START
+    return out
+
+
+def verdicts(of: Vehicle, preset: str, wind: str, missions: tuple[str, ...], seeds: int) -> dict[str, Any]:
+    """Table of all faults."""
+    rows: dict[str, Any] = {}
+    for mission in missions:
+        for name, (word, right) in FAULTS.items():
+            said: dict[str, int] = {}
+            good, before, detected, isolated = 0, 0, [], []
+            for k in range(seeds):
+                v = verdict(flight(50000 + k, mission, wind, 45.0, (f"{word}@{START:g}",)), of, preset)
+                key = "nothing" if v["said"] is None else " ".join(v["said"]) or "no signature"
+                said[key] = said.get(key, 0) + 1
+                good += v["said"] is not None and tuple(v["said"]) in right
+                before += v["before"] > 0
+                detected += [v["detected"]] if v["detected"] is not None else []
+                isolated += [v["isolated"]] if v["isolated"] is not None else []
+            rows[f"{mission}: {name}"] = {
+                "flights": seeds, "right": good, "said": said, "alarms_before": before,
+                "detected": float(np.median(detected)) if detected else None, "isolated": float(np.median(isolated)) if isolated else None,
+            }  # fmt: skip
+            print(preset, wind, mission, name, rows[f"{mission}: {name}"], flush=True)
+    return rows
+
+
+def errors(log: FlightLog, of: Vehicle, without: dict[str, str]) -> tuple[float, float, float, float]:
+    """RMS tilt, largest tilt, RMS yaw [deg] and RMS velocity, all axes [m/s], from 25 s to 80 s."""
+    s = haltere.run(log, "fault-tolerant", set={"fault_tolerant.isolate": "off", **without}, vehicle=of, scored=False)
+    truth, use = log["truth"], (s.t >= 25.0) & (s.t <= 80.0)
+    k = np.searchsorted(truth.t, s.t[use]).clip(0, len(truth.t) - 1)
+    a, b = s.vector("q", "wxyz")[use], np.column_stack([truth[f"q_{c}"] for c in "wxyz"])[k]
+    down = [np.column_stack([2 * (x * z - w * y), 2 * (y * z + w * x), w * w - x * x - y * y + z * z]) for w, x, y, z in (a.T, b.T)]
+    yaw = [np.arctan2(2 * (x * y + w * z), w * w + x * x - y * y - z * z) for w, x, y, z in (a.T, b.T)]
+    tilt = np.degrees(np.arccos(np.clip((down[0] * down[1]).sum(axis=1), -1.0, 1.0)))
+    turn = np.degrees(np.angle(np.exp(1j * (yaw[0] - yaw[1]))))
+    v = s.vector("vel", "ned")[use] - truth.vector("vel", "ned")[k]
+    return (
+        float(np.sqrt(np.mean(tilt**2))), float(tilt.max()), float(np.sqrt(np.mean(turn**2))), float(np.sqrt((v**2).sum(axis=1).mean())),
+    )  # fmt: skip
+
+
+def navigation(of: Vehicle, seeds: int) -> dict[str, Any]:
+    """Medians over seeds of `errors`."""
+    rows: dict[str, Any] = {}
+    for wind in WINDS:
+        logs = [flight(51000 + k, "lissajous", wind, 90.0) for k in range(seeds)]
+        for name, without in WITHOUT.items():
+            e = np.array([errors(log, of, without) for log in logs])
+            rows[f"{wind}: {name}"] = {"flights": seeds, "median": np.median(e, axis=0).tolist(), "worst": e.max(axis=0).tolist()}
+            print(wind, name, np.round(np.median(e, axis=0), 2), flush=True)
+    return rows
+
+
+def false_alarms(of: Vehicle, flights: int) -> dict[str, Any]:
+    """Verdicts in flights without a fault, by wind, and hours in the air."""
+    out: dict[str, Any] = {}
+    missions = ("hover", "box", "figure-eight", "lissajous", "tour")
+    for wind in ("still", "gusts"):
+        n, hours, said = 0, 0.0, []
+        for k in range(flights):
+            s = haltere.run(flight(60000 + k, missions[k % 5], wind, 90.0), "fault-tolerant", vehicle=of, scored=False)
+            found = [e for e in s.events if e["kind"] in VERDICTS]
+            n += len(found)
+            said += [f"{missions[k % 5]} {60000 + k}: {' '.join(e['candidates'])}" for e in found]
+            hours += float(s.t[-1] - s.t[0]) / 3600.0
+        low, high = poisson_interval(n)
+        out[wind] = {"alarms": n, "hours": hours, "per_hour": [n / hours, low / hours, high / hours], "said": said}
+        print(wind, out[wind], flush=True)
+    return out
+
+
+def main() -> None:
+    """Make the tables."""
+    parser = argparse.ArgumentParser()
+    parser.add_argument("--seeds", type=int, default=10)
+    parser.add_argument("--flights", type=int, default=20, help="for navigation")
+    parser.add_argument("--clean", type=int, default=100, help="flights without a fault, in each wind")
+    parser.add_argument("--out", type=Path, required=True)
+    a = parser.parse_args()
+    kept = a.out.with_name("hummingbird_identified.toml")
+    if not kept.exists():
+        kept.write_text(
+            "# Made by vehicle() of docs/_fault_tolerant.py, on three simulated flights.\n" + vehicle().to_toml(), encoding="utf-8"
+        )
+    of = load_vehicle(kept)
+    out: dict[str, Any] = {}
+    for name, part in {
+        "navigation": lambda: navigation(of, a.flights),
+        "default, still air": lambda: verdicts(of, "default", "still", ("hover", "box"), a.seeds),
+        "default, gusts": lambda: verdicts(of, "default", "gusts", ("box",), a.seeds),
+        "false alarms": lambda: false_alarms(of, a.clean),
+        "as-corrected, still air": lambda: verdicts(of, "as-corrected", "still", ("box",), a.seeds),
+    }.items():
+        out[name] = part()
+        a.out.write_text(json.dumps(out, indent=1) + "\n", encoding="utf-8")
+
+
+if __name__ == "__main__":
+    main()
