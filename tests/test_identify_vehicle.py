@@ -12,11 +12,12 @@ import pytest
 
 import haltere
 from converters_air import wemuav
+from converters_indiflight import captured
 from haltere.cli import app
 from haltere.errors import HaltereError
 from haltere.estimators.lumped import Lumped, lumped_of
 from haltere.flight.folder import write_folder
-from haltere.flight.log import FlightLog, FlightMeta, Stream
+from haltere.flight.log import FlightLog, Stream
 from haltere.flight.vehicle import Vehicle, load_vehicle, parse_vehicle
 from haltere.identify.instrument import instrumented
 from haltere.identify.prepare import motion
@@ -322,27 +323,6 @@ def test_the_verb(tmp_path: Path, excited: FlightLog) -> None:
     assert {p.name for p in out.parent.iterdir()} == {"mine.toml", "mine.json", "mine.html"}
     assert tomllib.loads(out.read_text())["lumped"]["preset"] == "full"
     assert load_vehicle(out).lumped
-
-
-def captured(path: Path, seed: int = 1) -> FlightLog:
-    """A flight of indiflight with its motion capture as GNSS (noise 0.02 m, 0.05 m/s) and told attitude: it has no satellite fixes."""
-    flight = haltere.read(path)
-    truth = flight["truth"]
-    rng = np.random.default_rng(seed)
-    good = np.isfinite(truth.vector("pos", "ned")).all(axis=1) & np.isfinite(truth.vector("q", "wxyz")).all(axis=1)
-    good &= np.r_[True, np.diff(truth.t) > 0.0]
-    t, n = truth.t[good], int(good.sum())
-    pos = truth.vector("pos", "ned")[good] + 0.02 * rng.standard_normal((n, 3))
-    vel = truth.vector("vel", "ned")[good] + 0.05 * rng.standard_normal((n, 3))
-    gnss = {
-        "t": t, "lat": 52.0 + pos[:, 0] / 111250.0, "lon": 4.37 + pos[:, 1] / (111320.0 * np.cos(np.radians(52.0))), "alt": -pos[:, 2],
-        **{f"vel_{a}": vel[:, k] for k, a in enumerate("ned")}, "h_acc": np.full(n, 0.05), "v_acc": np.full(n, 0.05),
-        "s_acc": np.full(n, 0.07),
-    }  # fmt: skip
-    attitude = {"t": t} | {f"q_{a}": truth[f"q_{a}"][good] for a in "wxyz"}
-    said = "GNSS and attitude are motion capture, with noise added"
-    streams = {"imu": flight["imu"], "rotors": flight["rotors"], "gnss": gnss, "attitude": attitude}
-    return FlightLog(streams, FlightMeta(name=path.stem[-5:], source=f"indiflight; {said}, seed {seed}"), [said])
 
 
 def on_indiflight(folder: Path, unseen: tuple[str, ...]) -> VehicleIdentification:
