@@ -19,9 +19,11 @@ from haltere.estimators.lumped import Lumped, lumped_of
 from haltere.flight.folder import write_folder
 from haltere.flight.log import FlightLog, Stream
 from haltere.flight.vehicle import Vehicle, load_vehicle, parse_vehicle
+from haltere.identify.checks import check
 from haltere.identify.instrument import instrumented
 from haltere.identify.prepare import motion
 from haltere.identify.rotors import speeds_of
+from haltere.identify.track import in_wind
 from haltere.identify.vehicle import VehicleIdentification, identify_vehicle
 from haltere.identify.vehicle_files import document, to_toml
 from haltere.report.vehicle_model import vehicle_page
@@ -349,6 +351,21 @@ def test_indiflight_whole(shared_data: Path) -> None:
     unseen = np.array([c.explained for c in d.checks if not c.seen])
     assert len(unseen) == 8
     assert (np.median(unseen[:, 2:], axis=0) > [0.75, 0.4, 0.6, 0.6]).all()
+
+
+def test_wemuav_drag_is_explained_by_the_anemometers_wind(shared_data: Path) -> None:
+    """The model of the square, whose wind was fitted and not told, leaves less of both flights in the wind of the mast than in none.
+
+    Of its own flight and of the hover of another day.
+    """
+    flights = {path.stem.split("__")[-1]: wemuav(path) for path in sorted((shared_data / "wemuav").glob("FLY*.csv"))}
+    square = identify_vehicle(flights["Square"], still=False)
+    hover = identify_vehicle(flights["Hover"], still=True)
+    for tr, arm in ((square.tracks[0], square.arm), (hover.tracks[0], hover.arm)):
+        mast = flights[tr.motion.name.split("__")[-1]]["truth"]
+        told = np.column_stack([mast["wind_n"], mast["wind_e"]])
+        without, with_wind = (check(in_wind(tr, mast.t, w), square.lumped, arm, False) for w in (0.0 * told, told))
+        assert np.linalg.norm(with_wind.error[:2]) < 0.5 * np.linalg.norm(without.error[:2])
 
 
 def test_wemuav_thrust_is_one_constant(shared_data: Path) -> None:
