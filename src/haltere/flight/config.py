@@ -284,6 +284,7 @@ KEYS: dict[str, Key] = {
     "diagnosis.gyro": Key(0.3 * DEG, "rad/s", "Change of a gyro bias that is no fault.", low=0.0),
     "diagnosis.accel": Key(0.08, "m/s^2", "Change of an accelerometer bias that is no fault.", low=0.0),
     "imu.kind": switch("instant", "An IMU sample is the value at its time, or the mean since the sample before.", ("instant", "mean")),
+    "imu.unit": switch("0", "Which of the log's inertial units is used: 0 the first, 1 the stream imu.1, and so on.", ("0", "1", "2", "3")),
     "baro.temperature": Key(
         math.nan, "K", "Air temperature at the ground, scales pressure altitude. Default: standard atmosphere.", low=200.0, high=330.0
     ),
