@@ -31,6 +31,8 @@ from haltere.flight.log import FlightLog
 from haltere.flight.solution import Solution
 from haltere.flight.vehicle import Vehicle
 from haltere.metrics.disturbance import describe, disturbances
+from haltere.metrics.faults import findings as inertial_findings
+from haltere.metrics.faults import tell
 from haltere.metrics.summary import summarise
 from haltere.metrics.units import better, stations
 from haltere.metrics.units import events as differences
@@ -154,6 +156,9 @@ def run(
             facts["warnings"].append(f"smoothed: {lost} times what came after could not be used; what is before was smoothed by itself")
     if scored and disturbances(solution.events):
         describe(solution, shown, _unwatched(resolved, initial, model, t, gyro, accel, offered, solution.t))
+    if scored and resolved["diagnosis.inertial"] == "on" and inertial_findings(solution.events):
+        solution.without = _without(resolved, initial, model, t, gyro, accel, offered)
+        tell(solution)
     if scored and len(stations(flight)) > 1 and not attitude_only:
         solution.events += _units(flight, resolved, initial, model, offered, solution.events)
     summarise(solution, shown, facts, scored)
@@ -248,6 +253,17 @@ def _unwatched(
     w, x, y, z = rows[1:5]
     yaw = np.unwrap(np.arctan2(2.0 * (x * y + w * z), w * w + x * x - y * y - z * z))
     return np.asarray(np.interp(at, rows[0], yaw)) if rows.shape[1] else np.full(len(at), np.nan)
+
+
+def _without(
+    config: Config, initial: InitialState | None, model: Lumped | None, t: FloatArray, gyro: FloatArray, accel: FloatArray, m: Measurements
+) -> Solution:
+    """The same run with no inertial fault named, ten rows a second."""
+    plain = config.changed(diagnosis__inertial="off")
+    S = new_state(plain, initial, model)
+    rows, _, events, _ = _loop(S, parameters(plain), t, gyro, accel, m, np.empty((COVARIANCE_ROWS, 0)), None, False)
+    table = _table(np.ascontiguousarray(rows[:, _decimate(rows[0], 10.0)]), S, True)
+    return Solution(table, {}, events, plain)
 
 
 def _units(
