@@ -12,7 +12,9 @@ import haltere
 from haltere.errors import HaltereError
 from haltere.flight.corrections import on_unit
 from haltere.flight.log import FlightLog, Stream
+from haltere.metrics.faults import apart
 from haltere.metrics.units import agreement, contradicted, part, stations
+from haltere.report import page
 from haltere.simulate import Scenario, inject, simulate
 
 WORDS = ("gyro.x:bias=3deg/s", "gyro.z:bias=6deg/s", "accel.x:bias=0.8m/s2", "accel.z:bias=0.8m/s2")
@@ -108,3 +110,21 @@ def test_faults_put_into_log_0036_are_named_by_its_two_units(shared_data: Path) 
             (event,) = of_units(haltere.run(faulty, set={"diagnosis.inertial": "off"}))
             assert event["candidates"] == [f"{'' if bad == 'imu' else 'imu.1.'}{word.split(':')[0]}"]
             assert event["t_isolated"] - 81.3 < 5.0
+
+
+def test_the_report_shows_suspects_and_the_run_without() -> None:
+    flight = inject(simulate(Scenario(mission="lissajous", duration=60.0, seed=8)), ["gyro.x:bias=5deg/s@35"])
+    solution = haltere.run(flight, set={"diagnosis.inertial": "on"})
+    assert solution.without is not None
+    (event,) = [e for e in solution.events if e["sensor"] == "gyro"]
+    assert "without the finding" in event["evidence"]
+    off = apart(solution, solution.without)
+    assert off["tilt"][off["t"] < 35.0].max() < 1e-4
+    truth = flight["truth"]
+    k = np.searchsorted(truth.t, solution.without.t).clip(0, len(truth) - 1)
+    alike = np.abs(np.sum(truth.vector("q", "wxyz")[k] * solution.without.vector("q", "wxyz"), axis=1))
+    worst = np.degrees(2.0 * np.arccos(np.clip(alike, 0.0, 1.0))).max()
+    assert off["tilt"].max() < worst + 2.0  # what it would have cost is no more than the run without is wrong
+    text = page(solution, flight)
+    assert "<h2>Faults" in text
+    assert haltere.run(flight, set={"diagnosis.inertial": "off"}).without is None
