@@ -68,17 +68,18 @@ def _suspects(c: Context, found: list[dict[str, Any]]) -> Figure:
         rows.append((round(start, 4), round(end, 4), text))
 
     for e in sorted(found, key=lambda e: float(e["t_detected"])):
-        own = e["sensor"] + (f".{e['axis']}" if e["axis"] is not None else "")
-        onset = float(e["t_onset"] if e["t_onset"] is not None else e["t_detected"])
-        over = float(e["t_recovered"]) if e["t_recovered"] is not None else c.span[1]
-        named = e["t_isolated"] is not None or len(e["candidates"]) <= 1
-        until = float(e["t_isolated"] or e["t_detected"]) if named else over
-        for who in e["candidates"] or [own]:
+        own = e["sensor"] + (f".{e['axis']}" if e.get("axis") is not None else "")
+        seen, known, end = float(e["t_detected"]), e.get("t_isolated"), e.get("t_recovered")
+        onset, over = float(e["t_onset"]) if e.get("t_onset") is not None else seen, c.span[1] if end is None else float(end)
+        candidates = e.get("candidates") or [own]
+        named = known is not None or len(candidates) == 1
+        until = (seen if known is None else float(known)) if named else over
+        for who in candidates:
             label = _label(who)
             colour = SENSOR_COLOURS.get(who.rsplit(".", 1)[0].rsplit(".", 1)[-1], "imu")
             bar(label, colour, onset, until, 4, f"{label}: {e['kind']}, suspected {onset:.2f} to {until:.2f} s", "suspected")
             if named:
-                bar(label, colour, until, over, 13, f"{label}: {e['kind']}, named from {until:.2f} s. {e['evidence']}", "named")
+                bar(label, colour, until, over, 13, f"{label}: {e['kind']}, named from {until:.2f} s. {e.get('evidence') or ''}", "named")
     n = len(labels)
     layout = {
         "margin": {"l": LEFT, "r": 12, "t": TOP, "b": FOOT}, "hovermode": "closest",
