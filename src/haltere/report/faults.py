@@ -65,7 +65,7 @@ def _suspects(c: Context, found: list[dict[str, Any]]) -> Figure:
             "line": {"color": f"@{colour}", "width": width},
             "hovertemplate": "%{text}<extra></extra>",
         })  # fmt: skip
-        rows.append((round(start, 4), round(end, 4), text))
+        rows.append((round(start, 4), round(end, 4), plain(text)))
 
     for e in sorted(found, key=lambda e: float(e["t_detected"])):
         own = e["sensor"] + (f".{e['axis']}" if e.get("axis") is not None else "")
