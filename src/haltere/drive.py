@@ -30,6 +30,7 @@ from haltere.flight.local import geodetic_from_local
 from haltere.flight.log import FlightLog
 from haltere.flight.solution import Solution
 from haltere.flight.vehicle import Vehicle
+from haltere.metrics import control
 from haltere.metrics.disturbance import describe, disturbances
 from haltere.metrics.faults import findings as inertial_findings
 from haltere.metrics.faults import tell
@@ -161,6 +162,8 @@ def run(
         tell(solution)
     if scored and len(stations(flight)) > 1 and not attitude_only:
         solution.events += _units(flight, resolved, initial, model, offered, solution.events)
+    if scored and model is None and specification.POSITION and not attitude_only:
+        solution.events += control.events(flight, solution)
     summarise(solution, shown, facts, scored)
     for name, stream in flight.streams.items():  # as read, before anything was left out
         solution.summary["streams"][name]["n"] = len(stream)
