@@ -29,7 +29,7 @@ def test_flights_without_a_fault_are_answered(mission: str) -> None:
         assert unanswered(flight, haltere.run(flight, scored=False)) is None
 
 
-@pytest.mark.parametrize("mission", ["hover", "lissajous", "box"])
+@pytest.mark.parametrize("mission", ["lissajous", "box"])
 @pytest.mark.parametrize("rotor", [0, 3])
 def test_a_rotor_that_loses_thrust_is_named(mission: str, rotor: int) -> None:
     flight = flown(mission, 61, f"rotor.{rotor}:thrust=0.7@60.3")
