@@ -12,15 +12,18 @@ import pytest
 
 import haltere
 from converters_air import wemuav
+from converters_indiflight import captured
 from haltere.cli import app
 from haltere.errors import HaltereError
 from haltere.estimators.lumped import Lumped, lumped_of
 from haltere.flight.folder import write_folder
-from haltere.flight.log import FlightLog, FlightMeta, Stream
+from haltere.flight.log import FlightLog, Stream
 from haltere.flight.vehicle import Vehicle, load_vehicle, parse_vehicle
+from haltere.identify.checks import check
 from haltere.identify.instrument import instrumented
 from haltere.identify.prepare import motion
 from haltere.identify.rotors import speeds_of
+from haltere.identify.track import in_wind
 from haltere.identify.vehicle import VehicleIdentification, identify_vehicle
 from haltere.identify.vehicle_files import document, to_toml
 from haltere.report.vehicle_model import vehicle_page
@@ -324,27 +327,6 @@ def test_the_verb(tmp_path: Path, excited: FlightLog) -> None:
     assert load_vehicle(out).lumped
 
 
-def captured(path: Path, seed: int = 1) -> FlightLog:
-    """A flight of indiflight with its motion capture as GNSS (noise 0.02 m, 0.05 m/s) and told attitude: it has no satellite fixes."""
-    flight = haltere.read(path)
-    truth = flight["truth"]
-    rng = np.random.default_rng(seed)
-    good = np.isfinite(truth.vector("pos", "ned")).all(axis=1) & np.isfinite(truth.vector("q", "wxyz")).all(axis=1)
-    good &= np.r_[True, np.diff(truth.t) > 0.0]
-    t, n = truth.t[good], int(good.sum())
-    pos = truth.vector("pos", "ned")[good] + 0.02 * rng.standard_normal((n, 3))
-    vel = truth.vector("vel", "ned")[good] + 0.05 * rng.standard_normal((n, 3))
-    gnss = {
-        "t": t, "lat": 52.0 + pos[:, 0] / 111250.0, "lon": 4.37 + pos[:, 1] / (111320.0 * np.cos(np.radians(52.0))), "alt": -pos[:, 2],
-        **{f"vel_{a}": vel[:, k] for k, a in enumerate("ned")}, "h_acc": np.full(n, 0.05), "v_acc": np.full(n, 0.05),
-        "s_acc": np.full(n, 0.07),
-    }  # fmt: skip
-    attitude = {"t": t} | {f"q_{a}": truth[f"q_{a}"][good] for a in "wxyz"}
-    said = "GNSS and attitude are motion capture, with noise added"
-    streams = {"imu": flight["imu"], "rotors": flight["rotors"], "gnss": gnss, "attitude": attitude}
-    return FlightLog(streams, FlightMeta(name=path.stem[-5:], source=f"indiflight; {said}, seed {seed}"), [said])
-
-
 def on_indiflight(folder: Path, unseen: tuple[str, ...]) -> VehicleIdentification:
     """Two flights fitted, others predicted."""
     logs = [[captured(next(folder.glob(f"*{k}.BFL"))) for k in names] for names in (("267", "281"), unseen)]
@@ -369,6 +351,21 @@ def test_indiflight_whole(shared_data: Path) -> None:
     unseen = np.array([c.explained for c in d.checks if not c.seen])
     assert len(unseen) == 8
     assert (np.median(unseen[:, 2:], axis=0) > [0.75, 0.4, 0.6, 0.6]).all()
+
+
+def test_wemuav_drag_is_explained_by_the_anemometers_wind(shared_data: Path) -> None:
+    """The model of the square, whose wind was fitted and not told, leaves less of both flights in the wind of the mast than in none.
+
+    Of its own flight and of the hover of another day.
+    """
+    flights = {path.stem.split("__")[-1]: wemuav(path) for path in sorted((shared_data / "wemuav").glob("FLY*.csv"))}
+    square = identify_vehicle(flights["Square"], still=False)
+    hover = identify_vehicle(flights["Hover"], still=True)
+    for tr, arm in ((square.tracks[0], square.arm), (hover.tracks[0], hover.arm)):
+        mast = flights[tr.motion.name.split("__")[-1]]["truth"]
+        told = np.column_stack([mast["wind_n"], mast["wind_e"]])
+        without, with_wind = (check(in_wind(tr, mast.t, w), square.lumped, arm, False) for w in (0.0 * told, told))
+        assert np.linalg.norm(with_wind.error[:2]) < 0.5 * np.linalg.norm(without.error[:2])
 
 
 def test_wemuav_thrust_is_one_constant(shared_data: Path) -> None:

@@ -25,14 +25,19 @@ from haltere.estimators.smoother import node_width, smoothed
 from haltere.estimators.step import COVARIANCE_ROWS
 from haltere.estimators.verdicts import VERDICTS, verdict
 from haltere.flight.config import Config
-from haltere.flight.corrections import correct
+from haltere.flight.corrections import correct, on_unit
 from haltere.flight.door import Checked, check, fit
 from haltere.flight.local import geodetic_from_local
 from haltere.flight.log import FlightLog
 from haltere.flight.solution import Solution
 from haltere.flight.vehicle import Vehicle
+from haltere.metrics import control
 from haltere.metrics.disturbance import describe, disturbances
+from haltere.metrics.faults import findings as inertial_findings
+from haltere.metrics.faults import tell
 from haltere.metrics.summary import summarise
+from haltere.metrics.units import better, stations
+from haltere.metrics.units import events as differences
 from haltere.strapdown.layout import IMU_CAPACITY
 
 __all__ = ["run", "usable"]
@@ -162,6 +167,13 @@ def run(
             facts["warnings"].append(f"smoothed: {lost} times what came after could not be used; what is before was smoothed by itself")
     if scored and disturbances(solution.events):
         describe(solution, shown, _unwatched(resolved, initial, model, t, gyro, accel, offered, solution.t))
+    if scored and resolved["diagnosis.inertial"] == "on" and inertial_findings(solution.events):
+        solution.without = _without(resolved, initial, model, t, gyro, accel, offered)
+        tell(solution)
+    if scored and len(stations(flight)) > 1 and not attitude_only:
+        solution.events += _units(flight, resolved, initial, model, offered, solution.events)
+    if scored and model is None and specification.POSITION and not attitude_only:
+        solution.events += control.events(flight, solution)
     summarise(solution, shown, facts, scored)
     for name, stream in flight.streams.items():  # as read, before anything was left out
         solution.summary["streams"][name]["n"] = len(stream)
@@ -254,6 +266,42 @@ def _unwatched(
     w, x, y, z = rows[1:5]
     yaw = np.unwrap(np.arctan2(2.0 * (x * y + w * z), w * w + x * x - y * y - z * z))
     return np.asarray(np.interp(at, rows[0], yaw)) if rows.shape[1] else np.full(len(at), np.nan)
+
+
+def _without(
+    config: Config, initial: InitialState | None, model: Lumped | None, t: FloatArray, gyro: FloatArray, accel: FloatArray, m: Measurements
+) -> Solution:
+    """The same run with no inertial fault named, ten rows a second."""
+    plain = config.changed(diagnosis__inertial="off")
+    S = new_state(plain, initial, model)
+    rows, _, events, _ = _loop(S, parameters(plain), t, gyro, accel, m, np.empty((COVARIANCE_ROWS, 0)), None, False)
+    table = _table(np.ascontiguousarray(rows[:, _decimate(rows[0], 10.0)]), S, True)
+    return Solution(table, {}, events, plain)
+
+
+def _units(
+    flight: FlightLog, config: Config, initial: InitialState | None, model: Lumped | None, m: Measurements, told: list[dict[str, Any]]
+) -> list[dict[str, Any]]:
+    """Events of further inertial units; of two that differ both are run by themselves, with nothing taken back."""
+    plain = config.changed(diagnosis__inertial="off")
+    runs: dict[str, dict[str, NDArray[Any]]] = {}
+
+    def aids(stream: str) -> dict[str, NDArray[Any]]:
+        if stream not in runs:
+            blind = on_unit(flight, stream).without("onboard", "truth")
+            t, gyro, accel = imu_arrays(blind, check(blind, upright=config.estimator != "ahrs", given=config.values))
+            begin = new_state(plain, initial, model)
+            parts = _loop(begin, parameters(plain), t, gyro, accel, m, np.empty((COVARIANCE_ROWS, 0)), None, False)[1]
+            runs[stream] = _aid_table(parts)
+        return runs[stream]
+
+    def likelier(other: str, onset: float, until: float) -> float | None:
+        try:
+            return better(aids("imu"), aids(other), onset, until)
+        except HaltereError:
+            return None
+
+    return differences(flight, likelier, told)
 
 
 def _drain(S: NDArray[np.void], aids: NDArray[np.void], parts: list[NDArray[np.void]], events: list[dict[str, Any]]) -> None:

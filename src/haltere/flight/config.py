@@ -304,6 +304,7 @@ KEYS: dict[str, Key] = {
     "exclude.gyro": exclusion("Gyro axes that are not to be used, and when: a sensor known to be broken, or a trial without it."),
     "exclude.accel": exclusion("The same of the accelerometer."),
     "imu.kind": switch("instant", "An IMU sample is the value at its time, or the mean since the sample before.", ("instant", "mean")),
+    "imu.unit": switch("0", "Which of the log's inertial units is used: 0 the first, 1 the stream imu.1, and so on.", ("0", "1", "2", "3")),
     "baro.temperature": Key(
         math.nan, "K", "Air temperature at the ground, scales pressure altitude. Default: standard atmosphere.", low=200.0, high=330.0
     ),

@@ -21,7 +21,8 @@ from haltere.flight.schema import base_name
 from haltere.flight.units import factor
 
 __all__ = [
-    "AXES", "CALIBRATION", "UNIT_KEYS", "calibrated", "calibration", "correct", "mounted", "mounting_matrix", "raw_vectors",
+    "AXES", "CALIBRATION", "UNIT_KEYS", "calibrated", "calibration", "correct", "mounted", "mounting_matrix", "on_unit",
+    "raw_vectors",
 ]  # fmt: skip
 
 FloatArray = NDArray[np.float64]
@@ -99,6 +100,10 @@ def correct(flight: FlightLog, config: Mapping[str, Any]) -> FlightLog:
                     notes.append(f"{name}: {stem} x, y, z taken as {word} as configured ({key})")
                 if stem == "mag" and all(f"raw_{a}" in streams[name] for a in "xyz"):
                     streams[name] = _with(streams[name], _turned("raw", streams[name].vector("raw"), word))
+    unit_ = str(config.get("imu.unit", "0"))
+    if unit_ != "0":
+        streams = dict(on_unit(FlightLog(streams, meta), f"imu.{unit_}").streams)
+        notes.append(f"imu is the log's imu.{unit_}, and the other way round, as configured (imu.unit)")
     parameters = calibration(config)
     if parameters is not None and CALIBRATED in streams:
         mag = streams[CALIBRATED]
@@ -115,6 +120,24 @@ def correct(flight: FlightLog, config: Mapping[str, Any]) -> FlightLog:
     if not notes:
         return flight
     return FlightLog(streams, meta, [*flight.notes, *notes], flight.discarded)
+
+
+def on_unit(flight: FlightLog, stream: str) -> FlightLog:
+    """The same flight with another inertial unit as ``imu``, and ``imu`` as that one.
+
+    Raises
+    ------
+    HaltereError
+        The flight has no such unit.
+    """
+    if stream == "imu":
+        return flight
+    if stream not in flight:
+        there = ", ".join(n for n in flight if base_name(n) == "imu")
+        raise HaltereError(f"a stream {stream}", there or "no imu", "imu.unit", "imu.unit=0 takes the first")
+    streams = dict(flight.streams)
+    streams["imu"], streams[stream] = streams[stream], streams["imu"]
+    return FlightLog(streams, flight.meta, flight.notes, flight.discarded)
 
 
 def calibration(config: Mapping[str, Any]) -> FloatArray | None:

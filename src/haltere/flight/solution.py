@@ -46,6 +46,8 @@ class Solution:
         at times spaced by at least 0.1 s, for consistency statistics. The attitude block is of the body-frame rotation error.
     smoothed
         The same rows smoothed over the whole run, where that was asked for; ``smoothed.parquet``.
+    without
+        Rows of the same run in which no inertial fault was named, some a second, where one was; it is not written to a file.
     """
 
     table: dict[str, FloatArray]
@@ -55,6 +57,7 @@ class Solution:
     summary: dict[str, Any] = field(default_factory=dict)
     covariance: dict[str, FloatArray] = field(default_factory=dict)
     smoothed: Solution | None = None
+    without: Solution | None = None
 
     @property
     def t(self) -> FloatArray:

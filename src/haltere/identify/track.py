@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import itertools
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,7 +14,7 @@ from haltere.identify.prepare import Motion, Samples, matrices
 from haltere.identify.rotors import Speeds, box
 from haltere.vehicle.regressors import AERO, COLUMNS, lumped_layout, regress
 
-__all__ = ["FORCE", "MOMENT", "Track", "Windows", "flying", "track"]
+__all__ = ["FORCE", "MOMENT", "Track", "Windows", "flying", "in_wind", "track"]
 
 FloatArray = NDArray[np.float64]
 BoolArray = NDArray[np.bool_]
@@ -83,11 +83,17 @@ def flying(m: Motion, speeds: Speeds) -> BoolArray:
 
 def track(m: Motion, speeds: Speeds, windows: Samples, wind: FloatArray) -> Track:
     """A flight with the wind (k, 2) at its windows' times."""
+    still = Track(m, speeds, np.zeros((0, 3)), np.zeros((0, 3)), m.density / RHO0, flying(m, speeds))
+    return in_wind(still, windows.t, wind)
+
+
+def in_wind(tr: Track, t: FloatArray, wind: FloatArray) -> Track:
+    """The same flight in another wind, north and east (k, 2) [m/s] at times t (k,): one that an anemometer told, or none."""
+    m = tr.motion
     W = np.zeros((len(m.t), 3))
     for k in range(2):
-        W[:, k] = np.interp(m.t, windows.t, wind[:, k])
-    v = np.einsum("kji,kj->ki", matrices(m.q_nb), m.vel_n - W)
-    return Track(m, speeds, W, v, m.density / RHO0, flying(m, speeds))
+        W[:, k] = np.interp(m.t, t, wind[:, k])
+    return replace(tr, wind=W, v_air=np.einsum("kji,kj->ki", matrices(m.q_nb), m.vel_n - W))
 
 
 def _dt(t: FloatArray) -> float:

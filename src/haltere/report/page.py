@@ -9,6 +9,7 @@ from haltere.flight.solution import Solution
 from haltere.report import overview, sections, tables
 from haltere.report.context import Context
 from haltere.report.document import document
+from haltere.report.faults import faults
 from haltere.report.health import health
 from haltere.report.markup import Section, escape, section_html
 from haltere.report.panels import Figure
@@ -45,7 +46,7 @@ def page(solution: Solution, flight: FlightLog, command: str | None = None) -> s
     timeline = overview.timeline(c)
     timeline.after = tables.events(c)
     parts = [
-        timeline, sections.attitude(c), sections.velocity(c), sections.position(c), view(c), sections.biases(c), wind(c),
+        timeline, faults(c), sections.attitude(c), sections.velocity(c), sections.position(c), view(c), sections.biases(c), wind(c),
         sections.errors(c), sections.innovations(c), tables.consistency(c), health(c), tables.data(c), tables.configuration(c, command),
     ]  # fmt: skip
     shown = [s for s in parts if s is not None and (s.figures or s.note or s.after)]
