@@ -200,7 +200,7 @@ def decide(s: Any, prm: Any, t: float) -> None:
         return
     candidates = 0
     if fault < 0 and len(s.bank) > 0 and x.alarms & ~(MUST[GYRO + 2] | MAY[GYRO + 2]) == 0 and x.alarms & J31:
-        # a gyro that drifts, or a compass: the model alone holds heading too badly for J21 to tell. The signatures do, or a field of another size
+        # a gyro that drifts, or a compass: the model alone holds heading too badly for J21 to tell; a field of another size does
         if t - x.t_first < DRIFT * prm.fault_tolerant_wait:
             return
         candidates = (1 << (GYRO + 2)) | (1 << COMPASS)
