@@ -143,8 +143,8 @@ def false_alarms(of: Vehicle, flights: int) -> dict[str, Any]:
             n += len(found)
             said += [f"{missions[k % 5]} {60000 + k}: {' '.join(e['candidates'])}" for e in found]
             hours += float(s.t[-1] - s.t[0]) / 3600.0
-        low, high = poisson_interval(n)
-        out[wind] = {"alarms": n, "hours": hours, "per_hour": [n / hours, low / hours, high / hours], "said": said}
+        low, high = poisson_interval(n, hours)
+        out[wind] = {"alarms": n, "hours": hours, "per_hour": [n / hours, low, high], "said": said}
         print(wind, out[wind], flush=True)
     return out
 
