@@ -169,7 +169,6 @@ def main() -> None:
         "default, still air": lambda: verdicts(of, "default", "still", ("hover", "box"), a.seeds),
         "default, gusts": lambda: verdicts(of, "default", "gusts", ("box",), a.seeds),
         "false alarms": lambda: false_alarms(of, a.clean),
-        "as-corrected, still air": lambda: verdicts(of, "as-corrected", "still", ("box",), a.seeds),
     }.items():
         out[name] = part()
         a.out.write_text(json.dumps(out, indent=1) + "\n", encoding="utf-8")

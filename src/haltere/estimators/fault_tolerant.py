@@ -4,9 +4,8 @@ The state is predicted by a model of forces and moments from rotor speeds, never
 barometer each have a local filter, and a federated filter fuses these (`haltere.estimators.local_filters`). Detection filters compare
 the model, the IMU and the other sensors in pairs; what fails is named by the pattern of their alarms and left out (`haltere.diagnosis`).
 
-It needs a vehicle file with ``[lumped]`` (``haltere identify``) and rotor speeds. Preset ``as-corrected`` is the source with what it left
-out put right: no wind, no biases, χ² of single residuals. ``default`` has wind and biases as states, and detectors of many windows. The
-printed thresholds of the source are lost, so there is no ``as-printed``.
+It needs a vehicle file with ``[lumped]`` (``haltere identify``) and rotor speeds. Wind and biases are states, and detectors have many
+windows. The printed thresholds of the source are lost, so there is no ``as-printed``; the source put right, ``as-corrected``, is to come.
 """
 
 from __future__ import annotations

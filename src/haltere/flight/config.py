@@ -25,7 +25,7 @@ PRESETS: dict[str, tuple[str, ...]] = {
     "ahrs": ("default",),
     "two-stage": ("default", "as-corrected", "as-printed"),
     "wind-attitude": ("default", "as-corrected", "as-printed"),
-    "fault-tolerant": ("default", "as-corrected"),
+    "fault-tolerant": ("default",),
 }
 ESTIMATORS = tuple(PRESETS)
 
@@ -400,9 +400,6 @@ _PRESET_OVERRIDES["wind-attitude", "as-printed"] = _PRESET_OVERRIDES["wind-attit
     "wind_attitude.residual": "printed", "wind_attitude.rows": "printed", "wind_attitude.normalise": "off",
     "wind_attitude.angles": "arctan", "wind_attitude.force": _NO_GATE, "wind_attitude.acceleration": _NO_GATE,
 }  # fmt: skip
-_PRESET_OVERRIDES["fault-tolerant", "as-corrected"] = {
-    "fault_tolerant.detector": "snapshot", "fault_tolerant.wind": "off", "fault_tolerant.biases": "off", "diagnosis.inertial": "off",
-}  # fmt: skip
 #: Where the keys begin that the published filter of wind-attitude is told; noise and delays a flight may tell of any sensor.
 _QUATERNION = (
     "noise.", "delay.", "gate.magnetometer", "gate.air", "aid.gnss", "aid.magnetometer", "aid.airdata", "aid.wind", "timeout.magnetometer",
@@ -498,7 +495,7 @@ def defaults(estimator: str = "navigator", preset: str = "default") -> dict[str,
     if preset not in PRESETS[estimator]:
         alone = f"{estimator} is not one of the published designs, so it has no printed or corrected form"
         if estimator == "fault-tolerant":
-            lost = "the printed thresholds of source F are lost, and most of its formulas with them; as-corrected is as near as can be"
+            lost = "the printed thresholds of source F are lost, and most of its formulas with them; as-corrected is not there yet"
             raise UsageError(f"a preset of {estimator} ({', '.join(PRESETS[estimator])})", repr(preset), "--preset", lost)
         raise UsageError(
             f"a preset of {estimator} ({', '.join(PRESETS[estimator])})",
