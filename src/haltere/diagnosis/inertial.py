@@ -17,7 +17,7 @@ from haltere.aids.fusing import DISTRUSTED, RUNNING
 from haltere.aids.magnetometer import heading_row
 from haltere.aids.record import E_FAULT, E_SUSPECT, GNSS_POSITION, GNSS_VELOCITY, NO_SENSOR, event_since
 from haltere.core.rotation import Mat, dcm
-from haltere.diagnosis import steps
+from haltere.diagnosis import doubt, steps
 from haltere.diagnosis.heading import by_heading, gyro_that_turns
 from haltere.diagnosis.healing import follow, heal, heal_between
 from haltere.diagnosis.steps import refuted, shown
@@ -167,6 +167,7 @@ def tick(s: Any, prm: Any, dt: float) -> bool:
         clear(b)
         if b.n_aligned != s.n_aligned:
             steps.forget(b)
+            doubt.begin(s)
             b.t_block = s.t + BLOCK
             for g in range(N_FAMILIES):
                 b.peak[g], b.waiting[g], b.usual[g] = 0.0, 0.0, 0.0
@@ -176,7 +177,7 @@ def tick(s: Any, prm: Any, dt: float) -> bool:
     b.yaw = s.yaw_corrected
     if s.t >= b.t_slot:
         b.t_slot = s.t + GRID - 1e-6
-        if known(s) and not sick(b):
+        if known(s) and doubt.judged(s) and not sick(b):
             if b.span > 0.0:
                 move(b)
             open_slot(s, next_slot(b, s.t), dcm((s.q[0], s.q[1], s.q[2], s.q[3]))[2])
@@ -185,6 +186,7 @@ def tick(s: Any, prm: Any, dt: float) -> bool:
     if s.t < b.t_judge:
         return False
     b.t_judge = s.t + EVERY - 1e-6
+    doubt.ground(s, prm)
     k = gyro_that_turns(s)
     if k >= 0:
         heal(s, GYRO + 2, k)
@@ -295,6 +297,9 @@ def judge(s: Any, prm: Any) -> bool:
         return False
     if b.alarm == 0:
         b.alarm, b.t_seen = 1, s.t
+    k = b.slot[lead]
+    if not doubt.may_name(b, lead, s.t) or not doubt.judged(s) or not doubt.fits(s, b.fault[lead] * SLOTS + k, k):
+        return False  # what is wrong is in no list
     candidates, others = 1 << lead, 0
     top = b.level[lead]
     for g in range(N_FAMILIES):
@@ -307,6 +312,8 @@ def judge(s: Any, prm: Any) -> bool:
     if b.alarm == 1 and s.t - b.t_seen > TELL:
         b.alarm = 2
         if lead < F_VELOCITY:
+            if not doubt.named(b, lead, s.t):
+                return False
             tell(s, prm, E_SUSPECT, lead, candidates)
             return heal_between(s, candidates)
     return False
@@ -324,6 +331,7 @@ def tell(s: Any, prm: Any, code: Any, g: int, candidates: int) -> None:
     if s.n_events > n:
         e = s.event[n]
         e.seen, e.size, e.sd, e.candidates = max(b.t_seen, b.onset[k]), b.num[j] / b.den[j], 1.0 / math.sqrt(b.den[j]), candidates
+        e.left = doubt.left(b, j, k) / max(b.num[j] * b.num[j] / b.den[j], 1e-9)
 
 
 @jit
@@ -333,6 +341,8 @@ def name(s: Any, prm: Any, g: int) -> bool:
     f, k = b.fault[g], b.slot[g]
     if g == F_COMPASS:  # the compass has a watch of its own
         b.alarm = 0
+        return False
+    if not doubt.named(b, g, s.t):
         return False
     tell(s, prm, E_FAULT, g, 1 << g)
     heal(s, f, k)
