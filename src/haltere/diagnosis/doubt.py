@@ -17,18 +17,20 @@ from haltere.aids.fusing import FORCED
 from haltere.aids.record import GNSS_POSITION, GNSS_VELOCITY
 from haltere.core.rotation import Vec
 
-__all__ = ["begin", "contact", "fits", "ground", "judged", "left", "may_name", "named", "near_ground"]
+__all__ = ["begin", "contact", "fits", "judged", "left", "may_name", "named", "near_ground", "watch"]
 
 #: Families of inertial faults, the first ones.
 N_INERTIAL = constant(6)
 #: Height [m] and speed [m/s] above which a vehicle that rested is in the air, and those below which it may touch the ground.
 LIFTED, FAST, LOW = 1.5, 2.0, 1.0
+#: Faster than this [m/s] nothing is judged, nor for so long [s] after: delays, scale and lever arms make errors that look like faults.
+FASTEST, AFTER_FAST = 18.0, 10.0
 #: After contact nothing is judged for so long [s]; it is a specific force this far [m/s^2] from the mean of late. After GNSS was forced in.
 CONTACT, PUSHED, AFTER_FORCED = 1.0, 20.0, 5.0
 #: Parts of what a signature explains that it may leave, and so many sigma of what is usual; see docs/diagnosis.md.
 LEAVES, SIGMAS = 0.35, 4.0
-#: A fit must have been good for so long [s].
-GOOD = 0.3
+#: A fit must have been good for so long [s]; one that is not within that time after the alarm never is, and nothing is judged for a time.
+GOOD, NEVER, AFTER_NEVER = 0.3, 5.0, 8.0
 #: A part that is named more often than this within that time [s] is not named, nor healed, for the next so many seconds.
 OFTEN, WITHIN, MUTE = 2, 30.0, 60.0
 
@@ -61,9 +63,16 @@ def near_ground(s: Any) -> bool:
 
 
 @jit
-def ground(s: Any, prm: Any) -> None:
-    """Bring up to date whether the vehicle is in the air: it rose or is fast since it last rested, or was never seen at rest."""
+def watch(s: Any, prm: Any) -> None:
+    """Bring up to date whether the vehicle is in the air, and until when nothing is judged.
+
+    In the air: it rose or is fast since it last rested, or was never seen at rest.
+    """
     b = s.bank[0]
+    if s.aid[GNSS_VELOCITY].started == FORCED or s.aid[GNSS_POSITION].started == FORCED:
+        b.t_doubt = max(b.t_doubt, s.t + AFTER_FORCED)
+    if s.v[0] * s.v[0] + s.v[1] * s.v[1] + s.v[2] * s.v[2] > FASTEST * FASTEST:
+        b.t_doubt = max(b.t_doubt, s.t + AFTER_FAST)
     w, f = (s.w_raw[0], s.w_raw[1], s.w_raw[2]), (s.f_raw[0], s.f_raw[1], s.f_raw[2])
     if rest.at_rest(s, prm, w, f):
         b.aloft, b.floor, b.t_rest = 0, s.p[2], s.t
@@ -76,10 +85,8 @@ def ground(s: Any, prm: Any) -> None:
 
 @jit
 def judged(s: Any) -> bool:
-    """Whether what is measured now may be held against a sensor: in the air, not just after contact, GNSS not let in by force."""
+    """Whether what is measured now may be held against a sensor: in the air, not just after contact, nothing in doubt."""
     b = s.bank[0]
-    if s.aid[GNSS_VELOCITY].started == FORCED or s.aid[GNSS_POSITION].started == FORCED:
-        b.t_doubt = s.t + AFTER_FORCED
     return b.aloft == 1 and s.t > b.t_doubt and s.t - b.t_contact > CONTACT
 
 
@@ -96,6 +103,8 @@ def fits(s: Any, j: int, k: int) -> bool:
     allowed = LEAVES * b.num[j] * b.num[j] / b.den[j] + SIGMAS * math.sqrt(b.spread[k])
     if left(b, j, k) > allowed:
         b.t_unfit = s.t
+        if s.t - b.t_seen > NEVER:
+            b.t_doubt = max(b.t_doubt, s.t + AFTER_NEVER)
     return s.t - b.t_unfit >= GOOD
 
 

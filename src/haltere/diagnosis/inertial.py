@@ -53,6 +53,8 @@ NONE = constant(-1)
 GRID, OLDEST, EVERY, TELL = 0.25, 15.0, 0.1, 2.5
 #: An inertial fault is named so long [s] after the alarm at the earliest: what is sudden is rather in what was measured.
 SETTLE = 0.4
+#: And what is measured is found wrong by a fault that lasts so long [s]: a gust on a barometer, a glitch, do not.
+LASTS = 1.2
 #: By how much a name must exceed the others; and for an axis of the gyro against that of the accelerometer which looks most like it.
 MARGIN, MARGIN_ALIKE = 9.0, 16.0
 #: What it says for a gyro axis that the raw samples show its step; margins as a part of the statistic, since responses are linear and
@@ -177,7 +179,7 @@ def tick(s: Any, prm: Any, dt: float) -> bool:
     b.yaw = s.yaw_corrected
     if s.t >= b.t_slot:
         b.t_slot = s.t + GRID - 1e-6
-        if known(s) and doubt.judged(s) and not sick(b):
+        if known(s) and s.t > b.t_doubt and not sick(b):
             if b.span > 0.0:
                 move(b)
             open_slot(s, next_slot(b, s.t), dcm((s.q[0], s.q[1], s.q[2], s.q[3]))[2])
@@ -186,7 +188,7 @@ def tick(s: Any, prm: Any, dt: float) -> bool:
     if s.t < b.t_judge:
         return False
     b.t_judge = s.t + EVERY - 1e-6
-    doubt.ground(s, prm)
+    doubt.watch(s, prm)
     k = gyro_that_turns(s)
     if k >= 0:
         heal(s, GYRO + 2, k)
@@ -307,7 +309,7 @@ def judge(s: Any, prm: Any) -> bool:
         if g != lead and top - b.level[g] < margin:
             candidates |= 1 << g
             others += 1
-    if others == 0 and (lead >= F_VELOCITY or s.t - b.t_seen >= SETTLE):
+    if others == 0 and s.t - b.t_seen >= (SETTLE if lead < F_VELOCITY else LASTS):
         return name(s, prm, lead)
     if b.alarm == 1 and s.t - b.t_seen > TELL:
         b.alarm = 2
