@@ -25,8 +25,9 @@ N_INERTIAL = constant(6)
 LIFTED, FAST, LOW = 1.5, 2.0, 1.0
 #: Faster than this [m/s] nothing is judged, nor for so long [s] after: delays, scale and lever arms make errors that look like faults.
 FASTEST, AFTER_FAST = 18.0, 10.0
-#: After contact nothing is judged for so long [s]; it is a specific force this far [m/s^2] from the mean of late. After GNSS was forced in.
-CONTACT, PUSHED, AFTER_FORCED = 1.0, 20.0, 5.0
+#: After contact nothing is judged for so long [s]; it is a specific force this far [m/s^2] from the mean of late. After GNSS was forced
+#: in, and after a gap of the IMU.
+CONTACT, PUSHED, AFTER_FORCED, AFTER_GAP = 1.0, 20.0, 5.0, 3.0
 #: Parts of what a signature explains that it may leave, and so many sigma of what is usual; see docs/diagnosis.md.
 LEAVES, SIGMAS = 0.35, 4.0
 #: A fit must have been good for so long [s]; one that is not within that time after the alarm never is, and nothing is judged for a time.

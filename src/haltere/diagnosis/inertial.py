@@ -177,6 +177,10 @@ def tick(s: Any, prm: Any, dt: float) -> bool:
         for a in range(len(b.slope)):
             b.slope[a] = 0.0
     b.yaw = s.yaw_corrected
+    if b.n_gaps != s.n_gaps:  # what happened meanwhile is in no response
+        b.n_gaps = s.n_gaps
+        clear(b)
+        b.t_doubt = max(b.t_doubt, s.t + doubt.AFTER_GAP)
     if s.t >= b.t_slot:
         b.t_slot = s.t + GRID - 1e-6
         if known(s) and s.t > b.t_doubt and not sick(b):

@@ -85,6 +85,7 @@ def bank(n: int) -> np.dtype[np.void]:
         ("t_slot", "f8"),
         ("t_judge", "f8"),
         ("n_aligned", "i8"),
+        ("n_gaps", "i8"),
         ("yaw", "f8"),  # ``yaw_corrected`` as it was
         ("level", "f8", 14),  # by family: largest statistic, its fault and slot
         ("beyond", "f8", 14),  # likewise in thresholds; maxima of this block, of the one before, and what is usual
