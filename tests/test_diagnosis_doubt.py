@@ -81,7 +81,10 @@ def test_who_is_named_again_and_again_is_not_believed() -> None:
     assert [bool(doubt.named(b, g, t)) for g, t in ((0, 300.0), (4, 303.0), (1, 306.0), (5, 309.0))] == [True, True, True, False]
 
 
-@pytest.mark.parametrize(("height", "speed", "rested", "near"), [(0.5, 0.5, 1.0, True), (3.0, 0.5, 1.0, False), (0.5, 4.0, 1.0, False), (0.5, 0.5, -1e9, False)])  # fmt: skip
+@pytest.mark.parametrize(
+    ("height", "speed", "rested", "near"),
+    [(0.5, 0.5, 1.0, True), (3.0, 0.5, 1.0, False), (0.5, 4.0, 1.0, False), (0.5, 0.5, -1e9, False)],
+)
 def test_near_the_ground_is_low_over_where_it_rested_and_slow(height: float, speed: float, rested: float, near: bool) -> None:
     s = state()
     b = s["bank"][0]
