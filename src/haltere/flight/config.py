@@ -277,7 +277,7 @@ KEYS: dict[str, Key] = {
         ("off", "vanes", "drag", "auto"),
     ),
     "diagnosis.inertial": switch(
-        "on",
+        "off",
         "Look for faults of gyro and accelerometer axes by their signature in the innovations, name them, and take their effect back.",
     ),
     "diagnosis.false_alarms": positive(0.035, "1/h", "Wanted rate of false alarms; lower finds faults later."),
