@@ -17,7 +17,7 @@ from haltere.aids.fusing import FORCED
 from haltere.aids.record import GNSS_POSITION, GNSS_VELOCITY
 from haltere.core.rotation import Vec
 
-__all__ = ["begin", "contact", "fits", "judged", "left", "may_name", "named", "near_ground", "watch"]
+__all__ = ["begin", "contact", "fits", "judged", "left", "may_name", "named", "near_ground", "vouched", "watch"]
 
 #: Families of inertial faults, the first ones.
 N_INERTIAL = constant(6)
@@ -32,6 +32,8 @@ CONTACT, PUSHED, AFTER_FORCED, AFTER_GAP = 1.0, 20.0, 5.0, 3.0
 LEAVES, SIGMAS = 0.35, 4.0
 #: A fit must have been good for so long [s]; one that is not within that time after the alarm never is, and nothing is judged for a time.
 GOOD, NEVER, AFTER_NEVER = 0.3, 5.0, 8.0
+#: A compass is heard that spoke so long ago [s].
+HEARD = 0.5
 #: A part that is named more often than this within that time [s] is not named, nor healed, for the next so many seconds.
 OFTEN, WITHIN, MUTE = 2, 30.0, 60.0
 
@@ -89,6 +91,12 @@ def judged(s: Any) -> bool:
     """Whether what is measured now may be held against a sensor: in the air, not just after contact, nothing in doubt."""
     b = s.bank[0]
     return b.aloft == 1 and s.t > b.t_doubt and s.t - b.t_contact > CONTACT
+
+
+@jit
+def vouched(s: Any) -> bool:
+    """Whether a compass is heard: without it nothing but GNSS holds the attitude, and it must not be found wrong by that."""
+    return s.has_field == 1 and s.compass.out == 0 and s.t - s.bank[0].t_heading < HEARD
 
 
 @jit

@@ -304,6 +304,8 @@ def judge(s: Any, prm: Any) -> bool:
     if b.alarm == 0:
         b.alarm, b.t_seen = 1, s.t
     k = b.slot[lead]
+    if lead >= F_VELOCITY and lead < F_COMPASS and not doubt.vouched(s):
+        return False
     if not doubt.may_name(b, lead, s.t) or not doubt.judged(s) or not doubt.fits(s, b.fault[lead] * SLOTS + k, k):
         return False  # what is wrong is in no list
     candidates, others = 1 << lead, 0
