@@ -48,6 +48,8 @@ GROUPS = {"full": FULL, "half": HALF, "ramp": RAMP, "selector": SELECTOR, "outsi
 WINDS: dict[str, dict[str, float]] = {"still": {}, "gusts": {"n": 5.2, "e": 3.0, "gust": 1.2}}
 MISSIONS = ("hover", "lissajous", "box")
 START, AFTER = 24.0, 16.0
+#: Log whose track the mission ``track`` flies, set by ``--track``.
+TRACK: list[Path] = []
 #: It is off by default.
 ON = {"diagnosis.inertial": "on"}
 
@@ -91,6 +93,7 @@ def table(seeds: int, groups: Iterable[str], missions: Iterable[str], told: bool
                             fault=(f"{word}@{on:g}",),
                             landing=False,
                             tell_noise=told,
+                            track=TRACK[0] if mission == "track" else None,
                         )
                         outcomes.append(outcome(simulate(scenario)))
                     name = {"group": group, "mission": mission, "wind": wind, "fault": word, "told": told}
@@ -188,9 +191,12 @@ def main() -> None:
     parser.add_argument("--groups", default=",".join(GROUPS))
     parser.add_argument("--missions", default=",".join(MISSIONS))
     parser.add_argument("--told", type=int, default=0, help="seeds of ramps with the noise told to the filter")
+    parser.add_argument("--track", type=Path, help="log whose track the mission `track` flies; name that in --missions")
     parser.add_argument("--data", type=Path)
     parser.add_argument("--out", type=Path)
     a = parser.parse_args()
+    if a.track:
+        TRACK.append(a.track)
     warnings.simplefilter("ignore")
     out = {"made": datetime.date.today().isoformat(), "python": platform.python_version(), "seeds": a.seeds}
     out["faults"] = table(a.seeds, a.groups.split(","), a.missions.split(",")) if a.seeds else []

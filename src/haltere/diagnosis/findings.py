@@ -45,6 +45,7 @@ def findings(kind: str, record: np.void, events: list[dict[str, Any]]) -> None:
     size, sd = float(record["size"]) * factor, float(record["sd"]) * factor
     what = {6: "velocity ", 7: "velocity ", 8: "velocity ", 9: "position ", 10: "position ", 11: "position "}.get(family, "")
     evidence = f"{what}{size:+.3g} ± {sd:.2g} {unit} explains the innovations since {float(record['onset']):.2f} s"
+    evidence += f" and leaves {max(float(record['left']), 0.0):.0%} as much unexplained"
     isolated = kind == "fault"
     if isolated:
         done = "its effect was taken back" if sensor in ("gyro", "accel", "barometer") else "its effect was taken back; it is not heard"

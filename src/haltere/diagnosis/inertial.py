@@ -17,7 +17,7 @@ from haltere.aids.fusing import DISTRUSTED, RUNNING
 from haltere.aids.magnetometer import heading_row
 from haltere.aids.record import E_FAULT, E_SUSPECT, GNSS_POSITION, GNSS_VELOCITY, NO_SENSOR, event_since
 from haltere.core.rotation import Mat, dcm
-from haltere.diagnosis import steps
+from haltere.diagnosis import doubt, steps
 from haltere.diagnosis.heading import by_heading, gyro_that_turns
 from haltere.diagnosis.healing import follow, heal, heal_between
 from haltere.diagnosis.steps import refuted, shown
@@ -53,6 +53,8 @@ NONE = constant(-1)
 GRID, OLDEST, EVERY, TELL = 0.25, 15.0, 0.1, 2.5
 #: An inertial fault is named so long [s] after the alarm at the earliest: what is sudden is rather in what was measured.
 SETTLE = 0.4
+#: And what is measured is found wrong by a fault that lasts so long [s]: a gust on a barometer, a glitch, do not.
+LASTS = 1.2
 #: By how much a name must exceed the others; and for an axis of the gyro against that of the accelerometer which looks most like it.
 MARGIN, MARGIN_ALIKE = 9.0, 16.0
 #: What it says for a gyro axis that the raw samples show its step; margins as a part of the statistic, since responses are linear and
@@ -167,6 +169,7 @@ def tick(s: Any, prm: Any, dt: float) -> bool:
         clear(b)
         if b.n_aligned != s.n_aligned:
             steps.forget(b)
+            doubt.begin(s)
             b.t_block = s.t + BLOCK
             for g in range(N_FAMILIES):
                 b.peak[g], b.waiting[g], b.usual[g] = 0.0, 0.0, 0.0
@@ -174,9 +177,13 @@ def tick(s: Any, prm: Any, dt: float) -> bool:
         for a in range(len(b.slope)):
             b.slope[a] = 0.0
     b.yaw = s.yaw_corrected
+    if b.n_gaps != s.n_gaps:  # what happened meanwhile is in no response
+        b.n_gaps = s.n_gaps
+        clear(b)
+        b.t_doubt = max(b.t_doubt, s.t + doubt.AFTER_GAP)
     if s.t >= b.t_slot:
         b.t_slot = s.t + GRID - 1e-6
-        if known(s) and not sick(b):
+        if known(s) and s.t > b.t_doubt and not sick(b):
             if b.span > 0.0:
                 move(b)
             open_slot(s, next_slot(b, s.t), dcm((s.q[0], s.q[1], s.q[2], s.q[3]))[2])
@@ -185,6 +192,7 @@ def tick(s: Any, prm: Any, dt: float) -> bool:
     if s.t < b.t_judge:
         return False
     b.t_judge = s.t + EVERY - 1e-6
+    doubt.watch(s, prm)
     k = gyro_that_turns(s)
     if k >= 0:
         heal(s, GYRO + 2, k)
@@ -295,6 +303,11 @@ def judge(s: Any, prm: Any) -> bool:
         return False
     if b.alarm == 0:
         b.alarm, b.t_seen = 1, s.t
+    k = b.slot[lead]
+    if lead >= F_VELOCITY and lead < F_COMPASS and not doubt.vouched(s):
+        return False
+    if not doubt.may_name(b, lead, s.t) or not doubt.judged(s) or not doubt.fits(s, b.fault[lead] * SLOTS + k, k):
+        return False  # what is wrong is in no list
     candidates, others = 1 << lead, 0
     top = b.level[lead]
     for g in range(N_FAMILIES):
@@ -302,11 +315,13 @@ def judge(s: Any, prm: Any) -> bool:
         if g != lead and top - b.level[g] < margin:
             candidates |= 1 << g
             others += 1
-    if others == 0 and (lead >= F_VELOCITY or s.t - b.t_seen >= SETTLE):
+    if others == 0 and s.t - b.t_seen >= (SETTLE if lead < F_VELOCITY else LASTS):
         return name(s, prm, lead)
     if b.alarm == 1 and s.t - b.t_seen > TELL:
         b.alarm = 2
         if lead < F_VELOCITY:
+            if not doubt.named(b, lead, s.t):
+                return False
             tell(s, prm, E_SUSPECT, lead, candidates)
             return heal_between(s, candidates)
     return False
@@ -324,6 +339,7 @@ def tell(s: Any, prm: Any, code: Any, g: int, candidates: int) -> None:
     if s.n_events > n:
         e = s.event[n]
         e.seen, e.size, e.sd, e.candidates = max(b.t_seen, b.onset[k]), b.num[j] / b.den[j], 1.0 / math.sqrt(b.den[j]), candidates
+        e.left = doubt.left(b, j, k) / max(b.num[j] * b.num[j] / b.den[j], 1e-9)
 
 
 @jit
@@ -333,6 +349,8 @@ def name(s: Any, prm: Any, g: int) -> bool:
     f, k = b.fault[g], b.slot[g]
     if g == F_COMPASS:  # the compass has a watch of its own
         b.alarm = 0
+        return False
+    if not doubt.named(b, g, s.t):
         return False
     tell(s, prm, E_FAULT, g, 1 << g)
     heal(s, f, k)

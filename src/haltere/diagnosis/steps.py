@@ -16,6 +16,7 @@ from haltere._jit import constant, jit
 from haltere.aids import compass
 from haltere.aids.record import E_FAULT, E_OVER, NO_SENSOR, event_since
 from haltere.core.rotation import Vec, dcm
+from haltere.diagnosis import doubt
 from haltere.filter.signatures import clear
 from haltere.strapdown.bank import STEP_HISTORY, STEP_RING
 from haltere.strapdown.propagate import inject
@@ -49,6 +50,8 @@ HELD, HELD_TIME, HELD_RATIO, HELD_END = 10, 0.1, 4, 4
 END_GYRO, END_ACCEL = 4.0, 35.0
 #: Roughness: memories [s], ratio of the mean squares, how much more than the other axes, for how long [s].
 LATELY, EVER, ROUGH, ALONE_ROUGH, ROUGH_TIME = 0.2, 10.0, 9.0, 6.0, 1.0
+#: Where samples are further apart [s], second differences are motion.
+COARSE = 0.012
 #: Least rate and force [rad/s, m/s^2] that an axis may have had unseen, and for how long that is alike [s].
 UNSEEN_RATE, UNSEEN_FORCE, ALIKE = 0.3, 1.5, 0.3
 
@@ -82,6 +85,7 @@ def watch(s: Any, prm: Any, t: float, dt: float, w: Vec, f: Vec) -> bool:
     slow, fast = min(1.0, dt / MEMORY), min(1.0, dt / ALERT)
     quick, ever = min(1.0, dt / LATELY), min(1.0, dt / EVER)
     ready = d.filled >= 2 * HALF + 2
+    doubt.contact(s, f)
     if s.rest.still == 1:  # motors begin to turn: nothing is known yet of what is usual
         d.t_free = t + SPIN_UP
     found = -1
@@ -129,7 +133,7 @@ def watch(s: Any, prm: Any, t: float, dt: float, w: Vec, f: Vec) -> bool:
             d.h_low[i, c], d.h_high[i, c], d.h_sd[i, c] = d.low[c], d.high[c], scale(d, c)
             d.low[c], d.high[c] = 0.0, 0.0
     sick(s, prm, t, dt, new)
-    if found >= 0:
+    if found >= 0 and not doubt.near_ground(s) and t - s.bank[0].t_contact > doubt.CONTACT:
         return step_of(s, found, t)
     return False
 
@@ -230,7 +234,7 @@ def sick(s: Any, prm: Any, t: float, dt: float, new: tuple[float, float, float, 
             if o + i != c:
                 others *= d.quick[o + i] / max(d.slow[o + i], 1e-18)
         ratio = d.quick[c] / max(d.slow[c], 1e-18)
-        rough = ratio > ROUGH and ratio > ALONE_ROUGH * math.sqrt(others) and d.run[c] == 0
+        rough = ratio > ROUGH and ratio > ALONE_ROUGH * math.sqrt(others) and d.run[c] == 0 and dt < COARSE
         if d.wrong[c] == 0 and d.n > 4 * WARM:
             if not rough:
                 d.t_rough[c] = -1.0

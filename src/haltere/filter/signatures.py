@@ -61,6 +61,8 @@ ZERO, ONE = np.float32(0.0), np.float32(1.0)
 ALONE, FOLLOWED = 4.0, 1.2
 #: Components of an innovation that have a signature of their own: six of GNSS, and the heading (see haltere.aids.record).
 N_GNSS, C_HEADING = 6, 7
+#: Memory of the usual square of a component's innovation [s], from how many on it is known, and how far a lone one may move it.
+OWN, KNOWN, LONE_SQUARE = 40.0, 20.0, 9.0
 
 
 @jit
@@ -113,6 +115,7 @@ def open_slot(s: Any, k: int, down: Vec) -> None:
         b.num[j], b.den[j] = 0.0, 0.0
         for i in range(x.shape[0]):
             x[i, j] = 0.0
+    b.excess[k], b.spread[k] = 0.0, 0.0
     for a in range(3):
         x[9 + a, (GYRO + a) * SLOTS + k] = 1.0
         x[12 + a, (ACCEL + a) * SLOTS + k] = 1.0
@@ -174,6 +177,23 @@ def move(b: Any) -> None:
 
 
 @jit
+def add_square(b: Any, t: float, component: int, square: float) -> None:
+    """Take the square of a whitened innovation into what has come since each onset beyond what is usual of its component.
+
+    Without a fault that is nothing on average. What a true signature explains of it, num²/den, leaves about as little.
+    """
+    own = b.own[component]
+    b.heard[component] += 1.0
+    if b.heard[component] > KNOWN:
+        for k in range(len(b.live)):
+            b.excess[k] += square - own
+            b.spread[k] += 2.0 * own * own
+    rate = max(1.0 / b.heard[component], min(1.0, (t - b.t_own[component]) / OWN))
+    b.t_own[component] = t
+    b.own[component] += rate * (min(square, own * LONE_SQUARE + 1.0) - own)
+
+
+@jit
 def matched(s: Any, H: Row, S: float, y: float, component: int, evidence: bool, moved: bool) -> None:
     """Take one scalar innovation ``y`` of variance ``S`` into the bank, as the filter takes it.
 
@@ -203,6 +223,7 @@ def matched(s: Any, H: Row, S: float, y: float, component: int, evidence: bool, 
         weight = share * share / S
         z = weight * y
         b.fresh = 1
+        add_square(b, s.t, component, z * y)
         if component == C_HEADING:
             b.heading += HEARD * (y - b.heading)
             b.t_heading = s.t

@@ -76,10 +76,16 @@ def bank(n: int) -> np.dtype[np.void]:
         ("phi", _TRANSITION),
         ("span", "f8"),
         ("last", "f8", 20),  # whitened innovation before, by component
+        ("own", "f8", 20),  # mean square of the whitened innovations of the flight, by component, and their number
+        ("heard", "f8", 20),
+        ("t_own", "f8", 20),
+        ("excess", "f8", int(SLOTS)),  # by onset: how far the squares since then are above that, and the variance of this without a fault
+        ("spread", "f8", int(SLOTS)),
         ("fresh", "i8"),  # evidence has come since the last judgement
         ("t_slot", "f8"),
         ("t_judge", "f8"),
         ("n_aligned", "i8"),
+        ("n_gaps", "i8"),
         ("yaw", "f8"),  # ``yaw_corrected`` as it was
         ("level", "f8", 14),  # by family: largest statistic, its fault and slot
         ("beyond", "f8", 14),  # likewise in thresholds; maxima of this block, of the one before, and what is usual
@@ -98,6 +104,15 @@ def bank(n: int) -> np.dtype[np.void]:
         ("slope", "f8", 6),  # of a ramp that was named, by axis, until when
         ("t_slope", "f8", 6),
         ("healed", "i8"),
+        ("t_unfit", "f8"),  # when what explains most last left too much unexplained
+        ("t_doubt", "f8"),  # until when nothing is judged
+        ("t_named", "f8", 14),  # by family: when it was last named, how often in a row, until when it is not named again
+        ("n_named", "i8", 14),
+        ("t_mute", "f8", 14),
+        ("aloft", "i8"),  # in the air; height down where it last rested, when; last contact
+        ("floor", "f8"),
+        ("t_rest", "f8"),
+        ("t_contact", "f8"),
         ("t_turn", "f8"),  # of a compass that turns against the gyro: its onset, rate and duration when that was noticed
         ("turn_rate", "f8"),
         ("turn_lasted", "f8"),

@@ -237,6 +237,7 @@ EVENT = _record(
     ("size", "f8"),
     ("sd", "f8"),
     ("candidates", "i8"),
+    ("left", "f8"),  # what it leaves unexplained, as a part of what it explains
 )
 
 #: A first stage: the part of a state that prediction and updates touch, with the core states only.
