@@ -12,7 +12,7 @@ from typing import Any
 
 from haltere.errors import HaltereError, UsageError
 from haltere.flight import axes
-from haltere.flight.key import Key, Value, axes_key, delay, positive, switch, unit_key
+from haltere.flight.key import Key, Value, axes_key, delay, exclusion, positive, switch, unit_key
 from haltere.flight.units import unit_word
 
 __all__ = ["ESTIMATORS", "KEYS", "PRESETS", "Config", "Key", "Value", "defaults", "load", "parse_assignment", "resolve"]
@@ -283,6 +283,8 @@ KEYS: dict[str, Key] = {
     "diagnosis.false_alarms": positive(0.035, "1/h", "Wanted rate of false alarms; lower finds faults later."),
     "diagnosis.gyro": Key(0.3 * DEG, "rad/s", "Change of a gyro bias that is no fault.", low=0.0),
     "diagnosis.accel": Key(0.08, "m/s^2", "Change of an accelerometer bias that is no fault.", low=0.0),
+    "exclude.gyro": exclusion("Gyro axes that are not to be used, and when: a sensor known to be broken, or a trial without it."),
+    "exclude.accel": exclusion("The same of the accelerometer."),
     "imu.kind": switch("instant", "An IMU sample is the value at its time, or the mean since the sample before.", ("instant", "mean")),
     "baro.temperature": Key(
         math.nan, "K", "Air temperature at the ground, scales pressure altitude. Default: standard atmosphere.", low=200.0, high=330.0
@@ -324,6 +326,8 @@ GROUPS: dict[str, tuple[str, ...]] = {
 }
 
 _DIAGNOSIS = tuple(key for key in KEYS if key.startswith("diagnosis."))
+#: What only an estimator with a vehicle's model can do without.
+_EXCLUDE = tuple(key for key in KEYS if key.startswith("exclude."))
 _TWO_STAGE = tuple(key for key in KEYS if key.startswith("two_stage."))
 _WIND_ATTITUDE = tuple(key for key in KEYS if key.startswith("wind_attitude."))
 #: A wind taken for true, which only the published filter of wind-attitude needs.
@@ -383,10 +387,11 @@ _QUATERNION = (
 )  # fmt: skip
 #: Keys that an estimator does not have: changing them would change nothing, or make it another one.
 _FIXED: dict[str, tuple[str, ...]] = {
-    "navigator": (*_TWO_STAGE, *_WIND_ATTITUDE, *_GIVEN_WIND),
-    "ahrs": (*_OVERRIDES["ahrs"], *_TWO_STAGE, *_AIR, *_WIND_ATTITUDE, *_DIAGNOSIS),
-    "wind-attitude": (*_TWO_STAGE, *_DIAGNOSIS, "wind_attitude.filter"),
+    "navigator": (*_TWO_STAGE, *_WIND_ATTITUDE, *_GIVEN_WIND, *_EXCLUDE),
+    "ahrs": (*_OVERRIDES["ahrs"], *_TWO_STAGE, *_AIR, *_WIND_ATTITUDE, *_DIAGNOSIS, *_EXCLUDE),
+    "wind-attitude": (*_TWO_STAGE, *_DIAGNOSIS, *_EXCLUDE, "wind_attitude.filter"),
     "two-stage": (
+        *_EXCLUDE,
         *_WIND_ATTITUDE,
         *_AIR,
         "aid.barometer",
@@ -491,6 +496,8 @@ def _check(key: str, value: Any, where: str) -> Value:
             near = near if spec.words is not axes.WORDS else []
             raise UsageError(f"{key} to be {spec.unit}", repr(value), where, f"did you mean {near[0]!r}?" if near else "")
         return found
+    if spec.text is not None:
+        return spec.text(str(value), f"{where}: {key}" if where else key)
     try:
         number = float(value)
     except (TypeError, ValueError):

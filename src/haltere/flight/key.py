@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 
 from haltere.flight import axes
+from haltere.flight.exclusion import exclusion_text
 from haltere.flight.units import UNITS
 
-__all__ = ["Key", "Value", "axes_key", "delay", "positive", "switch", "unit_key"]
+__all__ = ["Key", "Value", "axes_key", "delay", "exclusion", "positive", "switch", "unit_key"]
 
 Value = float | str | bool
 
@@ -29,6 +31,8 @@ class Key:
         Allowed words of a switch, in the order of their codes 0, 1, 2.
     low, high
         Bounds of a number, both allowed.
+    text
+        Of a text that is neither: puts it into its usual form, or raises and names where it stands.
     """
 
     default: Value
@@ -37,6 +41,7 @@ class Key:
     words: tuple[str, ...] = ()
     low: float = -math.inf
     high: float = math.inf
+    text: Callable[[str, str], str] | None = None
 
 
 def positive(default: float, unit: str, doc: str) -> Key:
@@ -52,6 +57,11 @@ def switch(default: str, doc: str, words: tuple[str, ...] = ("off", "on")) -> Ke
 def delay(doc: str) -> Key:
     """A delay [s]."""
     return Key(0.0, "s", doc, low=0.0, high=2.0)
+
+
+def exclusion(doc: str) -> Key:
+    """Axes that are left out for a time."""
+    return Key("off", "off or spans such as xyz@20-80", doc, text=exclusion_text)
 
 
 def unit_key(unit: str, doc: str) -> Key:
