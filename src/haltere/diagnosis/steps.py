@@ -129,9 +129,15 @@ def watch(s: Any, prm: Any, t: float, dt: float, w: Vec, f: Vec) -> bool:
             d.h_low[i, c], d.h_high[i, c], d.h_sd[i, c] = d.low[c], d.high[c], scale(d, c)
             d.low[c], d.high[c] = 0.0, 0.0
     sick(s, prm, t, dt, new)
-    if found >= 0:
+    if found >= 0 and not replaced(s, found):
         return step_of(s, found, t)
     return False
+
+
+@jit
+def replaced(s: Any, c: int) -> bool:
+    """Whether a vehicle's model stands in for a channel."""
+    return len(s.pairs) > 0 and s.pairs[0].on[c] == 1
 
 
 @jit
@@ -240,7 +246,7 @@ def sick(s: Any, prm: Any, t: float, dt: float, new: tuple[float, float, float, 
                 fail(s, c, NOISE, t, d.t_rough[c], ratio, ROUGH)
         elif d.wrong[c] == NOISE and ratio < 0.5 * ROUGH:
             over(s, c, t)
-        if d.wrong[c] != 0:
+        if d.wrong[c] != 0 and not replaced(s, c):
             unsure(s, c, dt)
 
 

@@ -37,6 +37,7 @@ from haltere.estimators.rotors import model_of
 from haltere.flight import config as configuration
 from haltere.flight.config import Config
 from haltere.flight.corrections import calibrated, calibration
+from haltere.flight.exclusion import exclusion_table
 from haltere.flight.door import impossible_place, impossible_pressure
 from haltere.flight.names import nearest_column, nearest_stream
 from haltere.flight.schema import column as schema_column
@@ -142,10 +143,12 @@ def new_state(config: Config, initial: InitialState | None = None, vehicle: Lump
     """State record, one element, that has seen nothing yet; with the model of a vehicle where one is given."""
     quaternion = config["wind_attitude.filter"] == "quaternion"
     model = None if vehicle is None else vehicle.record()
-    kind = quaternion_layout() if quaternion else layout(**_sizes(config), rotors=0 if vehicle is None else len(vehicle.yaw))
+    kind = quaternion_layout() if quaternion else layout(**_sizes(config), **_of_vehicle(config, vehicle))
     record = as_records(np.zeros(1, kind))
     if model is not None:
         record["model"][0, 0] = model[0]
+        if record["pairs"].shape[1]:
+            record["pairs"]["told"][0, 0] = [exclusion_table(str(config[f"exclude.{sensor}"])) for sensor in ("gyro", "accel")]
     record["q"][0, 0] = 1.0
     home = (config.number("home.lat"), config.number("home.lon"), config.number("home.alt"))
     record["gravity"] = STANDARD_GRAVITY
@@ -167,6 +170,16 @@ def new_state(config: Config, initial: InitialState | None = None, vehicle: Lump
         else:
             _begin_from(record, config, initial)
     return record
+
+
+def _of_vehicle(config: Config, vehicle: Lumped | None) -> dict[str, int]:
+    """Rotors of a vehicle's model, and the states with which it stands in for axes of the IMU."""
+    if vehicle is None:
+        for key in ("exclude.gyro", "exclude.accel"):
+            if config[key] != "off":
+                raise UsageError(f"a vehicle's model to do without {key[8:]} axes", "none", key, "give a vehicle file (--vehicle)")
+        return {}
+    return {"rotors": len(vehicle.yaw), "twist": 3 if config.estimator == "navigator" else 0}
 
 
 def _published(record: NDArray[np.void], config: Config) -> None:

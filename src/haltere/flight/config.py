@@ -387,7 +387,7 @@ _QUATERNION = (
 )  # fmt: skip
 #: Keys that an estimator does not have: changing them would change nothing, or make it another one.
 _FIXED: dict[str, tuple[str, ...]] = {
-    "navigator": (*_TWO_STAGE, *_WIND_ATTITUDE, *_GIVEN_WIND, *_EXCLUDE),
+    "navigator": (*_TWO_STAGE, *_WIND_ATTITUDE, *_GIVEN_WIND),
     "ahrs": (*_OVERRIDES["ahrs"], *_TWO_STAGE, *_AIR, *_WIND_ATTITUDE, *_DIAGNOSIS, *_EXCLUDE),
     "wind-attitude": (*_TWO_STAGE, *_DIAGNOSIS, *_EXCLUDE, "wind_attitude.filter"),
     "two-stage": (

@@ -14,6 +14,7 @@ import numpy as np
 from haltere._jit import constant
 from haltere.core.lumped import lumped_layout
 from haltere.strapdown.bank import bank
+from haltere.strapdown.pairs import pairs
 
 __all__ = [
     "AID_STATE",
@@ -253,6 +254,8 @@ STAGE = _record(
     ("drag", "f8", (0,)),
     ("steady", "f8", (0,)),
     ("vane", "f8", (0,)),
+    ("twist", "f8", (0,)),
+    ("pairs", pairs(), (0,)),
     ("P", "f8", (CORE, CORE)),
     ("dx", "f8", CORE),
     ("u", "f8", CORE),
@@ -305,7 +308,7 @@ PARAMETERS = np.dtype(
 @cache
 def layout(
     baro: int = 0, mag: int = 0, stages: int = 0, wind: int = 0, drag: int = 0, vane: int = 0, banks: int = 0,
-    rotors: int = 0,
+    rotors: int = 0, twist: int = 0,
 ) -> np.dtype[np.void]:  # fmt: skip
     """State record type.
 
@@ -327,13 +330,15 @@ def layout(
         1 with the memory of diagnosis, else 0.
     rotors
         Number of rotors of the vehicle's model, 0 without one.
+    twist
+        3 with the offset of that model's moments as states, and all that lets it stand in for axes of the IMU, else 0.
 
     Returns
     -------
     numpy.dtype
         Nominal state, covariance ``P`` (n, n), scratch, queues, monitors and counters: the whole memory of a filter.
     """
-    n = CORE + baro + mag + (wind + 2 if wind else 0) + drag + vane
+    n = CORE + baro + mag + (wind + 2 if wind else 0) + drag + vane + twist
     return np.dtype(
         [
             ("t", "f8"),
@@ -348,6 +353,7 @@ def layout(
             ("drag", "f8", (drag,)),  # ln mu [1/s], ln c [1/m], offset of the thrust's axis along x and y [m/s^2]
             ("steady", "f8", (2 if wind else 0,)),  # what the wind returns to after gusts, likewise
             ("vane", "f8", (vane,)),  # ln of the airspeed's scale, offsets of angle of attack and sideslip [rad]
+            ("twist", "f8", (twist,)),  # what the moments of the vehicle's model lack [rad/s^2]
             ("P", "f8", (n, n)),
             ("dx", "f8", n),
             ("u", "f8", n),
@@ -396,6 +402,7 @@ def layout(
             ("a", STAGE, (stages,)),
             ("bank", bank(n), (banks,)),
             *_of_rotors(rotors),
+            ("pairs", pairs(), (1 if twist else 0,)),
             ("ring_head", "i8", N_QUEUES),
             ("ring_n", "i8", N_QUEUES),
             ("ring", MEASUREMENT, (N_QUEUES, MEASUREMENT_CAPACITY)),

@@ -259,7 +259,7 @@ def blow(s: Any, prm: Any, o: int, dt: float) -> None:
         P[o + i, o + i] += k * k * (1.0 - keep * keep)
     for i in range(2):
         P[m + i, m + i] += walk * walk * dt
-    for i in range(first, n):
+    for i in range(first, n - len(s.twist)):
         if i < m or i >= m + 2:
             P[i, i] += prm.noise_air_walk * prm.noise_air_walk * dt
 
