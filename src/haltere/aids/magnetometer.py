@@ -148,7 +148,7 @@ def offer(s: Any, prm: Any, m: Any, aids: Any) -> Offer:
     r = (white + slow) / max(horizontal * horizontal, 1e-6)
     return (
         ONE, C_HEADING, (heading, 0.0, 0.0), (0.0, 0.0, 0.0), (r, r, r), (row, row, row), prm.gate_magnetometer, timeout,
-        reason, ONLY_TURN, robust,
+        reason, ANY_TURN if rate_is_modelled(s) else ONLY_TURN, robust,
     )  # fmt: skip
 
 

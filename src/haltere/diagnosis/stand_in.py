@@ -23,7 +23,6 @@ from haltere.aids.drag import density_ratio
 from haltere.core.earth import STANDARD_DENSITY
 from haltere.core.rotation import Mat, Vec, dcm
 from haltere.filter.update import NONE, project, variance
-from haltere.strapdown.pairs import MARKS
 from haltere.vehicle.linear import linear
 
 __all__ = ["couple", "across", "forget", "hold", "stand_in", "stands", "twist_column"]
@@ -38,6 +37,8 @@ UNSEEN_RATE, UNSEEN_FORCE, ALIKE = 0.3, 1.5, 0.3
 NO_PAST, LEAST_FORCE, LEAST_MOMENT = 0.5, 0.05, 0.05
 #: A fault began so long [s] before its onset was seen, at most.
 EARLIER = 0.06
+#: What the model is off by lasts so long [s], and wanders by this part of its variance a second.
+LASTS, WANDER = 0.5, 0.03
 FORCES = constant(3)
 
 
@@ -51,12 +52,10 @@ def twist_column(s: Any) -> int:
 def forget(s: Any) -> None:
     """Begin anew: after alignment."""
     p = s.pairs[0]
-    p.any, p.flying, p.n_blocks, p.n, p.span, p.head, p.t_first = 0, 0, 0, 0.0, 0.0, 0, 0.0
-    p.t_ratio, p.t_bias, p.t_mark, p.t_usual, p.wrong, p.ground = -1e9, -1e9, -1e9, s.t + 10.0, 0, s.p[2]
+    p.any, p.flying, p.head, p.wrong, p.ground = 0, 0, 0, 0, s.p[2]
+    p.t_ratio, p.t_mark, p.t_usual = -1e9, -1e9, s.t + 10.0
     for i in range(6):
-        p.on[i], p.t_alarm[i], p.usual[i], p.peak[i], p.waiting[i], p.sum[i] = 0, 0.0, 0.0, 0.0, 0.0, 0.0
-    for i in range(MARKS):
-        p.m_t[i] = -1e9
+        p.on[i], p.usual[i], p.peak[i], p.waiting[i] = 0, 0.0, 0.0, 0.0
     for i in range(3):
         p.turn[i] = 0.0
     k = twist_column(s)
@@ -78,7 +77,7 @@ def density_of_noise(s: Any, axis: int) -> float:
     m = s.model[0]
     rho = min(max(m.ar1[axis], 0.0), 0.8)
     sd = max(m.sd[axis], 0.05)
-    return sd * sd * m.window[0 if axis < FORCES else 1] * (1.0 + rho) / (1.0 - rho)
+    return sd * sd * m.window[0 if axis < FORCES else 1] * (1.0 + rho) / (1.0 - rho) + 2.0 * LASTS * m.slow[axis] * m.slow[axis]
 
 
 @jit
@@ -323,7 +322,7 @@ def couple(s: Any, prm: Any, dt: float) -> None:
                 theta, vel, wind, square = slope_row(s, C, d, 1.0)
                 add_along(s, 3, c, (theta, vel, wind, square), dt)
                 q = density_of_noise(s, i)
-                P[12 + i, 12 + i] += 0.5 * offset_variance(s, i) * dt
+                P[12 + i, 12 + i] += WANDER * offset_variance(s, i) * dt
             for j in range(3):
                 for k in range(3):
                     P[3 + j, 3 + k] += q * dt * c[j] * c[k]
@@ -337,5 +336,5 @@ def couple(s: Any, prm: Any, dt: float) -> None:
                 unit = (1.0 if i == 0 else 0.0, 1.0 if i == 1 else 0.0, 1.0 if i == 2 else 0.0)
                 add_along(s, 9, unit, (theta, vel, wind, square, rate, offset), dt)
                 q = density_of_noise(s, 3 + i)
-                P[twist + i, twist + i] += 0.5 * offset_variance(s, 3 + i) * dt
+                P[twist + i, twist + i] += WANDER * offset_variance(s, 3 + i) * dt
             P[9 + i, 9 + i] += q * dt

@@ -27,7 +27,7 @@ from haltere.aids.record import (
     event,
 )
 from haltere.core.rotation import Vec, cross, dcm, mat_vec, quat_from_rotvec, quat_mul
-from haltere.diagnosis import inertial, stand_in, steps
+from haltere.diagnosis import inertial, model_faults, pairs, stand_in, steps
 from haltere.estimators import alignment, yaw_bank
 from haltere.filter.queue import pop_imu, push, push_imu
 from haltere.filter.rotors import push_rotors, rotors_at
@@ -331,6 +331,8 @@ def advance(s: Any, prm: Any, rows: Any, cov: Any, aids: Any, tape: Any, stage: 
             w0, f0, w1, f1 = stand_in.stand_in(s, prm, w0, f0, w1, f1, dt)
             s.w_raw[0], s.w_raw[1], s.w_raw[2] = w1
             s.f_raw[0], s.f_raw[1], s.f_raw[2] = f1
+            if pairs.gather(s, prm, w_raw, f_raw, dt) and pairs.listen(s, prm):
+                model_faults.judge(s, prm)
         north, east = s.v[0], s.v[1]
         if dt > LONG_STEP:
             bridge_gap(s, stage, prm, w0, f0, w1, f1, dt)

@@ -283,6 +283,11 @@ KEYS: dict[str, Key] = {
     "diagnosis.false_alarms": positive(0.035, "1/h", "Wanted rate of false alarms; lower finds faults later."),
     "diagnosis.gyro": Key(0.3 * DEG, "rad/s", "Change of a gyro bias that is no fault.", low=0.0),
     "diagnosis.accel": Key(0.08, "m/s^2", "Change of an accelerometer bias that is no fault.", low=0.0),
+    "diagnosis.vehicle": switch(
+        "on", "With a vehicle's model: compare it with gyro and accelerometer, and name a rotor or an axis of the model that fails."
+    ),
+    "diagnosis.force": Key(0.2, "m/s^2", "Change of what the model's force is off by that is no fault.", low=0.0),
+    "diagnosis.moment": Key(0.5, "rad/s^2", "The same of its moments.", low=0.0),
     "exclude.gyro": exclusion("Gyro axes that are not to be used, and when: a sensor known to be broken, or a trial without it."),
     "exclude.accel": exclusion("The same of the accelerometer."),
     "imu.kind": switch("instant", "An IMU sample is the value at its time, or the mean since the sample before.", ("instant", "mean")),

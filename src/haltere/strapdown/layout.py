@@ -238,6 +238,7 @@ EVENT = _record(
     ("size", "f8"),
     ("sd", "f8"),
     ("candidates", "i8"),
+    ("alarms", "f8", 6),  # when each pair of model and IMU alarmed [s], NaN: not
 )
 
 #: A first stage: the part of a state that prediction and updates touch, with the core states only.
@@ -296,6 +297,7 @@ PARAMETERS = np.dtype(
             "two_stage_radial two_stage_memory "
             "two_stage_haversine two_stage_height_sign "
             "diagnosis_inertial diagnosis_gyro diagnosis_accel diagnosis_threshold "
+            "diagnosis_vehicle diagnosis_force diagnosis_moment diagnosis_pair_threshold "
             "wind_attitude_integrator wind_attitude_residual wind_attitude_rows wind_attitude_normalise wind_attitude_angles "
             "wind_attitude_accel wind_attitude_force wind_attitude_acceleration wind_attitude_gate wind_attitude_air "
             "imu_mean horizon covariance_interval"

@@ -55,33 +55,35 @@ def pairs() -> np.dtype[np.void]:
                 ("level", "f8", 6),
                 ("drift", "f8", 6),
                 ("P", "f8", (6, 3)),
-                ("gain", "f8", 6),
                 ("sd", "f8", 6),
                 ("n_blocks", "i8"),
-                # innovations: variance against the expected one, correlation of neighbours, both learnt; the last one
+                # innovations: variance against the expected one, product of neighbours, both learnt; measurement variance of a block
                 ("c0", "f8", 6),
                 ("c1", "f8", 6),
                 ("z", "f8", 6),
-                ("r", "f8", 6),  # measurement variance of a block, learnt from differences of neighbours
+                ("r", "f8", 6),
                 ("before", "f8", 6),
                 ("w", windows(int(PAIR_WINDOW)), (6,)),
-                # statistic over threshold: now, largest of this block and of the one before, what is usual
-                ("beyond", "f8", 6),
+                # statistic over threshold: largest of this stretch and of the one before, what is usual
                 ("peak", "f8", 6),
                 ("waiting", "f8", 6),
                 ("usual", "f8", 6),
                 ("t_usual", "f8"),
-                # alarms: when first, onset as the window says; 0 none
+                # an alarm: when each pair gave it first (0: not), the first of all and its onset, size as the window had it
                 ("t_alarm", "f8", 6),
-                ("onset", "f8", 6),
                 ("t_first", "f8"),
-                ("step", "f8", 3),  # largest whitened innovation of the last alarm's first samples
-                ("gone", "i8", 6),  # blocks since the alarm that were quiet again
-                ("size", "f8", 6),  # change of the residual since the onset, and its 1 sigma
-                ("size_sd", "f8", 6),
+                ("onset", "f8"),
+                ("told_size", "f8", 6),
+                ("statistic", "f8"),
+                ("threshold", "f8"),
+                ("mark", "i8"),
+                ("early", "f8", 6),  # change of the levels since the onset, soon after it
                 ("healed", "i8"),
-                ("wrong", "i8"),  # bits of channels with a fault of the model that lasts
-                ("was", "f8", 6),
+                # faults of the model that last: bits by axis, then by rotor, and sizes
+                ("wrong", "i8"),
+                ("was", "f8", 14),
+                # gusts lately against those the filter expects
+                ("stir", "f8"),
                 # marks of the past: time, level, drift, turn
                 ("head", "i8"),
                 ("t_mark", "f8"),
