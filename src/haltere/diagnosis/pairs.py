@@ -14,9 +14,10 @@ from typing import Any
 
 from haltere._jit import constant, jit
 from haltere.core.rotation import Vec
-from haltere.diagnosis.stand_in import density_of_noise, mark_before, offset_variance
+from haltere.diagnosis.stand_in import across, density_of_noise, mark_before, offset_variance
 from haltere.filter.windows import empty, take
 from haltere.strapdown.pairs import MARKS
+from haltere.strapdown.propagate import gusts
 
 __all__ = ["BLOCK", "calm_again", "change", "gather", "listen", "restart"]
 
@@ -34,6 +35,8 @@ MOST_RHO = 0.9
 BEYOND_USUAL, STRETCH, RISE, FALL, CAP = 2.0, 10.0, 0.6, 0.1, 2.0
 #: Memory of gusts [s].
 STIR = 20.0
+#: Least part of the gusts expected that are taken for there.
+CALMEST = 0.2
 FORCES, AXES = constant(3), constant(6)
 
 
@@ -87,9 +90,9 @@ def use_bias(s: Any) -> None:
 def restart(s: Any) -> None:
     """Forget chains and alarms: on the ground, without rotor speeds, after alignment."""
     p = s.pairs[0]
-    p.n, p.span, p.t_first, p.t_bias, p.stir = 0.0, 0.0, 0.0, -1e9, 1.0
+    p.n, p.span, p.t_first, p.t_bias, p.stir, p.calm = 0.0, 0.0, 0.0, -1e9, 1.0, 1.0
     for i in range(6):
-        p.sum[i], p.drift[i], p.level[i] = 0.0, 0.0, 0.0
+        p.sum[i], p.drift[i], p.level[i], p.early[i], p.told_size[i] = 0.0, 0.0, 0.0, math.nan, 0.0
         calm_again(s, i)
     for k in range(MARKS):
         p.m_t[k] = -1e9
@@ -201,6 +204,13 @@ def remember(s: Any, prm: Any) -> None:
         p.m_level[k, i], p.m_drift[k, i], p.m_var[k, i] = p.level[i], p.drift[i], p.P[i, 0]
     for i in range(3):
         p.m_turn[k, i] = p.turn[i]
+    if len(s.wind) > 0 and not across(s):
+        gust, _ = gusts(s, prm)
+        blown = 0.0
+        for i in range(2):
+            blown += 0.5 * (s.wind[i] - s.steady[i]) * (s.wind[i] - s.steady[i])
+        p.stir += MARK / STIR * (blown / (gust * gust) - p.stir)
+        p.calm = math.sqrt(min(max(p.stir, CALMEST * CALMEST), 1.0))
 
 
 @jit

@@ -37,8 +37,8 @@ UNSEEN_RATE, UNSEEN_FORCE, ALIKE = 0.3, 1.5, 0.3
 NO_PAST, LEAST_FORCE, LEAST_MOMENT = 0.5, 0.05, 0.05
 #: A fault began so long [s] before its onset was seen, at most.
 EARLIER = 0.06
-#: What the model is off by lasts so long [s], and wanders by this part of its variance a second.
-LASTS, WANDER = 0.5, 0.03
+#: Least 1 sigma in a window, length of the long windows [s], and by what part of its variance an offset wanders a second.
+LEAST_NOISE, SECOND, WANDER = 0.05, 1.0, 0.03
 FORCES = constant(3)
 
 
@@ -73,11 +73,13 @@ def offset_variance(s: Any, axis: int) -> float:
 
 @jit
 def density_of_noise(s: Any, axis: int) -> float:
-    """Spectral density of what the model of an axis leaves, white, from windows of the identification."""
+    """Spectral density of what the model of an axis leaves: what changes between its windows, and what lasts about a second.
+
+    White noise of density q has the variance q/T in means over T. What lasts much longer is left to the offset.
+    """
     m = s.model[0]
-    rho = min(max(m.ar1[axis], 0.0), 0.8)
-    sd = max(m.sd[axis], 0.05)
-    return sd * sd * m.window[0 if axis < FORCES else 1] * (1.0 + rho) / (1.0 - rho) + 2.0 * LASTS * m.slow[axis] * m.slow[axis]
+    sd, slow = max(m.sd[axis], LEAST_NOISE), m.slow[axis]
+    return float(sd * sd * m.window[0 if axis < FORCES else 1] + slow * slow * SECOND)
 
 
 @jit

@@ -188,6 +188,7 @@ def step_of(s: Any, c: int, t: float) -> bool:
     s.P[c, c] += variance * (t - onset) * (t - onset)
     inject(s)
     clear(s.bank[0])
+    s.bank[0].healed += 1
     s.bank[0].yaw = s.yaw_corrected
     compass.forget(s)
     for a in range(6):  # the history is that of the failed sensor: it proves nothing any more

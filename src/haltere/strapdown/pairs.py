@@ -84,6 +84,7 @@ def pairs() -> np.dtype[np.void]:
                 ("was", "f8", 14),
                 # gusts lately against those the filter expects
                 ("stir", "f8"),
+                ("calm", "f8"),
                 # marks of the past: time, level, drift, turn
                 ("head", "i8"),
                 ("t_mark", "f8"),
