@@ -1,8 +1,8 @@
 """Test bench of a vehicle's model beside the IMU: faults of model, rotor and tachometer, steps of the wind, false alarms, axes left out.
 
-``python docs/_rotor_faults.py --seeds 20 --hours 5 --out docs/_data/rotor_faults.json`` makes the tables of the page on it. The vehicle file
-is identified on four simulated flights (seeds from 90011), geometry not given. Faults last and begin at one of seven phases of a 0.25 s grid
-after 24 s. Seeds of the tables (faults from 70000, flights without from 72000, axes left out from 74000) were not looked at before.
+``python docs/_rotor_faults.py --seeds 20 --hours 5 --out docs/_data/rotor_faults.json`` makes the tables. The vehicle file is identified
+on four simulated flights (seeds from 90011), geometry not given. Faults last and begin at one of seven phases of a 0.25 s grid after 24 s.
+Seeds of the tables: faults from 70000, flights without from 72000, axes left out from 74000; of the faults, three were looked at before.
 """
 
 from __future__ import annotations
@@ -54,7 +54,9 @@ def vehicle() -> Vehicle:
     ]).as_vehicle()  # fmt: skip
 
 
-def table(of: Vehicle, words: tuple[str, ...], seeds: int, missions: dict[str, float], winds: dict[str, dict[str, float]]) -> list[dict[str, Any]]:
+def table(
+    of: Vehicle, words: tuple[str, ...], seeds: int, missions: dict[str, float], winds: dict[str, dict[str, float]]
+) -> list[dict[str, Any]]:
     """Every fault, by mission and wind: what was named, and when."""
     rows = []
     for mission, scale in missions.items():
@@ -74,7 +76,8 @@ def table(of: Vehicle, words: tuple[str, ...], seeds: int, missions: dict[str, f
                 named = [o.isolation_delay for o in outcomes if math.isfinite(o.isolation_delay)]
                 rows.append({
                     "fault": word, "mission": mission, "wind": wind, "n": seeds,
-                    "right": sum(o.isolation == "right" for o in outcomes), "containing": sum(o.isolation == "containing" for o in outcomes),
+                    "right": sum(o.isolation == "right" for o in outcomes),
+                    "containing": sum(o.isolation == "containing" for o in outcomes),
                     "wrong": sum(o.isolation == "wrong" for o in outcomes), "missed": sum(not o.detected for o in outcomes),
                     "seen_median": round(float(np.median(delays)), 2) if delays else None,
                     "seen_97": round(float(np.quantile(delays, 0.97)), 2) if delays else None,
@@ -94,7 +97,14 @@ def false_alarms(of: Vehicle, hours: float) -> dict[str, Any]:
         scenario = Scenario(mission=mission, scale=missions[mission], duration=120.0, seed=72000 + i, wind=WINDS[wind], sensors=SENSORS)
         solution = haltere.run(simulate(scenario), vehicle=of, set=ON, scored=False)
         for e in alarms(solution.events):
-            found.append({"mission": mission, "wind": wind, "seed": 72000 + i, **{k: e[k] for k in ("sensor", "axis", "kind", "t_detected", "candidates", "evidence")}})
+            found.append(
+                {
+                    "mission": mission,
+                    "wind": wind,
+                    "seed": 72000 + i,
+                    **{k: e[k] for k in ("sensor", "axis", "kind", "t_detected", "candidates", "evidence")},
+                }
+            )
             print(json.dumps(found[-1]), flush=True)
         flown += float(solution.t[-1] - solution.t[0])
         i += 1
@@ -152,7 +162,11 @@ def speed(of: Vehicle) -> dict[str, float]:
         best = 1e9
         for _ in range(4):
             began = time.perf_counter()
-            best = min(best, float(haltere.run(flight, vehicle=of, set=keys, scored=False).summary["timings"]["filter_s"]), time.perf_counter() - began)
+            best = min(
+                best,
+                float(haltere.run(flight, vehicle=of, set=keys, scored=False).summary["timings"]["filter_s"]),
+                time.perf_counter() - began,
+            )
         out[name] = round(len(flight["imu"]) / best)
     print(out, flush=True)
     return out
@@ -176,7 +190,9 @@ def main() -> None:
         elif part == "false_alarms":
             out[part] = false_alarms(of, a.hours)
         else:
-            out[part] = table(of, HALF if part == "half" else FULL, a.seeds, MISSIONS, {"gusts": WINDS["gusts"]} if part == "gusts" else still)
+            out[part] = table(
+                of, HALF if part == "half" else FULL, a.seeds, MISSIONS, {"gusts": WINDS["gusts"]} if part == "gusts" else still
+            )
         if a.out:
             a.out.write_text(json.dumps(out, indent=1) + "\n", encoding="utf-8")
 

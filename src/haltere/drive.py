@@ -107,7 +107,9 @@ def run(
     if smooth and asked["magnetometer.refine"] == "on":
         raise UsageError("magnetometer.refine=off with a smoothed run", "on", "--smooth", "the smoother does not know those states yet")
     if smooth and model is not None:
-        raise UsageError("a smoothed run without a vehicle's model", str(vehicle)[:60], "--smooth", "the smoother does not know its states yet")
+        raise UsageError(
+            "a smoothed run without a vehicle's model", str(vehicle)[:60], "--smooth", "the smoother does not know its states yet"
+        )
     attitude_only = asked["wind_attitude.filter"] == "quaternion"
     if smooth and attitude_only:
         raise UsageError("no smoothing of the published filter", f"{estimator}, preset {preset}", "--smooth", "preset default has it")

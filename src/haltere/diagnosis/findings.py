@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 
 from haltere.diagnosis.inertial import FAMILIES
-from haltere.diagnosis.model_findings import of_the_model
 from haltere.diagnosis.model_faults import MODEL
+from haltere.diagnosis.model_findings import of_the_model
 from haltere.diagnosis.steps import DEATHS, STEP
 
 __all__ = ["findings"]

@@ -1,10 +1,10 @@
-"""What an alarm of model against IMU means: an axis of the model, a rotor or its tachometer, wind, or an inertial sensor. It detects nothing.
+"""What an alarm of model against IMU means: an axis of the model, a rotor or its tachometer, wind, or a sensor. It detects nothing.
 
-After the first alarm the others are waited for (theory.md §5.5, theory-amendments.md 2, 3, 16). A level of a rate that has stepped and stays
-is the gyro's; one that goes on is a moment that the model does not have. Roll, pitch and thrust in the ratio of one rotor are that rotor,
-which has less thrust or whose tachometer is wrong: that is not told apart. Thrust alone is the model's or the accelerometer's until the
-bank of `haltere.diagnosis.inertial` is silent with power. A force across the thrust axis is {model, wind} where the air was still, and
-nobody's in wind; both of them are wind, and no fault.
+After the first alarm the others are waited for (theory.md §5.5, theory-amendments.md 2, 3, 16). A level of a rate that has stepped and
+stays is the gyro's; one that goes on is a moment that the model does not have. Roll, pitch and thrust in the ratio of one rotor are that
+rotor, which has less thrust or whose tachometer is wrong: that is not told apart. Thrust alone is the model's or the accelerometer's until
+the bank of `haltere.diagnosis.inertial` is silent with power. A force across the thrust axis is {model, wind} where the air was still,
+and nobody's in wind; both of them are wind, and no fault.
 """
 
 from __future__ import annotations
@@ -27,7 +27,8 @@ MODEL, ROTOR = constant(64), constant(70)
 MOST = 8
 #: Bits of what an event may be: model axes, wind, accelerometer axes, gyro axes, rotors, their tachometers.
 CANDIDATES = (
-    "model.hx", "model.hy", "model.t", "model.r", "model.p", "model.q", "wind", "accel.x", "accel.y", "accel.z", "gyro.x", "gyro.y", "gyro.z",
+    "model.hx", "model.hy", "model.t", "model.r", "model.p", "model.q", "wind", "accel.x", "accel.y", "accel.z",
+    "gyro.x", "gyro.y", "gyro.z",
     *(f"rotor.{k}" for k in range(MOST)), *(f"rotors.{k}" for k in range(MOST)),
 )  # fmt: skip
 B_WIND, B_ACCEL, B_GYRO, B_ROTOR, B_TACHOMETER = (constant(i) for i in (6, 7, 10, 13, 21))
@@ -41,6 +42,8 @@ MARGIN, LIKE, LEAST_M, LEAST_F = 9.0, 0.2, 0.15, 0.08
 LEAST_ROTOR = 0.03
 #: Air that is still: wind and gusts below these [m/s].
 STILL = 1.5
+#: Drag that a wind as large as a force would have [1/s]; what the other axis may show of a force along one; in the air before [s].
+TYPICAL_DRAG, BESIDE, STILL_FOR = 0.3, 0.3, 3.0
 #: Statistics of the bank for silence with power: 99 %.
 POWER = 2.33
 #: A fault is over when the change is its reverse within this part.
@@ -64,7 +67,11 @@ def judge(s: Any, prm: Any) -> None:
     if p.mark < 0:
         settle(s)
         return
-    moments = p.t_alarm[R] != 0.0 or p.t_alarm[P] != 0.0 or p.t_alarm[Q] != 0.0
+    moments = False
+    for i in range(R, 6):  # later ones are what the vehicle makes of the first
+        if p.t_alarm[i] > p.t_first + COLLECT:
+            p.t_alarm[i] = 0.0
+        moments = moments or p.t_alarm[i] != 0.0
     if moments:
         of_moments(s, prm)
         settle(s)
@@ -84,6 +91,7 @@ def settle(s: Any) -> None:
     for i in range(6):
         calm_again(s, i)
         p.early[i], p.told_size[i] = math.nan, 0.0
+    p.still = 0
 
 
 @jit
@@ -227,14 +235,16 @@ def of_thrust(s: Any, prm: Any, since: float) -> None:
 def across(s: Any, prm: Any, since: float) -> None:
     """Forces across the thrust axis: wind, or in still air the model's or the accelerometer's."""
     p = s.pairs[0]
-    W = wind_n(s)
-    a = 0 if p.t_alarm[0] != 0.0 else 1
-    if p.t_alarm[0] != 0.0 and p.t_alarm[1] != 0.0:  # wind, whatever else
-        settle(s)
-        return
+    p.t_across = s.t
+    first, second = abs(p.told_size[0]), abs(p.told_size[1])
+    a = 0 if first > second else 1
     size = p.told_size[a]
-    still = W[0] * W[0] + W[1] * W[1] < STILL * STILL + (size / 0.3) * (size / 0.3)
-    if not still:
+    if p.still == 0:  # looked at once, soon after the alarm: later the filter's wind has followed
+        W = wind_n(s)
+        moved = size / TYPICAL_DRAG
+        still = W[0] * W[0] + W[1] * W[1] < STILL * STILL + moved * moved and p.t_flying < p.onset - STILL_FOR
+        p.still = 1 if still and min(first, second) < BESIDE * max(first, second) else -1
+    if p.still < 0:  # wind, whatever else
         settle(s)
         return
     quiet = silent(s, prm, a, size)

@@ -35,6 +35,8 @@ MOST_RHO = 0.9
 BEYOND_USUAL, STRETCH, RISE, FALL, CAP = 2.0, 10.0, 0.6, 0.1, 2.0
 #: Memory of gusts [s].
 STIR = 20.0
+#: A wind that changed, or was taken for one, is found again and again for so long [s]: forces are not judged meanwhile.
+FOLLOWS = 15.0
 #: Least part of the gusts expected that are taken for there.
 CALMEST = 0.2
 FORCES, AXES = constant(3), constant(6)
@@ -90,6 +92,7 @@ def use_bias(s: Any) -> None:
 def restart(s: Any) -> None:
     """Forget chains and alarms: on the ground, without rotor speeds, after alignment."""
     p = s.pairs[0]
+    p.t_across = -1e9
     p.n, p.span, p.t_first, p.t_bias, p.stir, p.calm = 0.0, 0.0, 0.0, -1e9, 1.0, 1.0
     for i in range(6):
         p.sum[i], p.drift[i], p.level[i], p.early[i], p.told_size[i] = 0.0, 0.0, 0.0, math.nan, 0.0
@@ -171,6 +174,8 @@ def listen(s: Any, prm: Any) -> bool:
         p.peak[i] = max(p.peak[i], over)
         if p.on[3 + i if i < FORCES else i - 3] == 1 or p.n_blocks < WARM or s.t - p.t_flying < AIRBORNE:
             continue
+        if i < FORCES and p.t_first == 0.0 and s.t - p.t_across < FOLLOWS:
+            continue
         factor = max(1.0, BEYOND_USUAL * p.usual[i])
         if over > factor and p.t_alarm[i] == 0.0:
             size = size_of(p, i, rho, dt)
@@ -215,7 +220,7 @@ def remember(s: Any, prm: Any) -> None:
 
 @jit
 def change(s: Any, i: int) -> float:
-    """What the level of a pair has changed by since before the alarm: a force [m/s^2], or a rate that no moment of the model made [rad/s]."""
+    """What the level of a pair has changed by since before the alarm: a force [m/s^2], or a rate that the model did not make [rad/s]."""
     p = s.pairs[0]
     k = p.mark
     if k < 0:

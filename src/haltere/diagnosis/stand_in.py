@@ -13,7 +13,6 @@ Healthy axes stay as they are. Where no rotor speed is known the last value hold
 
 from __future__ import annotations
 
-import math
 from typing import Any
 
 from haltere._jit import constant, jit
@@ -25,7 +24,7 @@ from haltere.core.rotation import Mat, Vec, dcm
 from haltere.filter.update import NONE, project, variance
 from haltere.vehicle.linear import linear
 
-__all__ = ["couple", "across", "forget", "hold", "stand_in", "stands", "twist_column"]
+__all__ = ["across", "couple", "forget", "hold", "stand_in", "stands", "twist_column"]
 
 #: In the air: thrust of the model above this part of gravity (theory-amendments.md §19), and so high above where it last rested [m].
 LEAST_THRUST, LIFTED = 0.5, 0.5
@@ -124,7 +123,7 @@ def evaluate(s: Any, prm: Any, w: Vec, dt: float) -> None:
         p.ratio, p.t_ratio = density_ratio(s, prm) * STANDARD_DENSITY / m.density, s.t + DENSITY_HOLDS
     v = air_velocity(s, dcm((s.q[0], s.q[1], s.q[2], s.q[3])), (s.v[0], s.v[1], s.v[2]))
     eta = (p.m[0], p.m[1], p.m[2]) if m.literal == 1 else w
-    f, a, D_v, D_w, M_v, M_w = linear(m, s.speed, s.spin_up, v, w, eta, p.ratio)
+    f, a, D_v, _, M_v, M_w = linear(m, s.speed, s.spin_up, v, w, eta, p.ratio)
     for i in range(3):
         p.f[i], p.m[i], p.v_a[i] = f[i], a[i], v[i]
         p.turn[i] += a[i] * dt

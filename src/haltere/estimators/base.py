@@ -37,8 +37,8 @@ from haltere.estimators.rotors import model_of
 from haltere.flight import config as configuration
 from haltere.flight.config import Config
 from haltere.flight.corrections import calibrated, calibration
-from haltere.flight.exclusion import exclusion_table
 from haltere.flight.door import impossible_place, impossible_pressure
+from haltere.flight.exclusion import exclusion_table
 from haltere.flight.names import nearest_column, nearest_stream
 from haltere.flight.schema import column as schema_column
 from haltere.strapdown.layout import CORE, layout

@@ -26,16 +26,16 @@ from haltere.aids.record import (
     WIND,
 )
 from haltere.core.earth import pressure_altitude
-from haltere.errors import UsageError
 from haltere.diagnosis.pairs import BLOCK
+from haltere.errors import UsageError
 from haltere.estimators.air import air_from_vanes, given_wind, steady_wind
+from haltere.filter.windows import glr_level
 from haltere.flight import config as configuration
 from haltere.flight.config import KEYS, Config
 from haltere.flight.corrections import mounted
 from haltere.flight.door import Checked, first_fix
 from haltere.flight.field import decimal_year, earth_field
 from haltere.flight.log import FlightLog, Stream
-from haltere.filter.windows import glr_level
 from haltere.strapdown.layout import PARAMETERS
 
 __all__ = ["Measurements", "alarm_level", "configure", "horizon", "imu_arrays", "measurements", "parameters", "request", "rotation_vector"]

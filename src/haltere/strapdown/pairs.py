@@ -51,7 +51,7 @@ def pairs() -> np.dtype[np.void]:
                 ("n", "f8"),
                 ("span", "f8"),
                 ("t_block", "f8"),
-                # chain of each pair: level (of a force its offset, of a moment the rate less `turn`), drift (offset of the moment), covariance
+                # chain of each pair: level (of a force its offset, of a moment the rate less `turn`), drift of it, covariance
                 ("level", "f8", 6),
                 ("drift", "f8", 6),
                 ("P", "f8", (6, 3)),
@@ -78,7 +78,9 @@ def pairs() -> np.dtype[np.void]:
                 ("threshold", "f8"),
                 ("mark", "i8"),
                 ("early", "f8", 6),  # change of the levels since the onset, soon after it
+                ("t_across", "f8"),  # last verdict on forces across the thrust axis was pending
                 ("healed", "i8"),
+                ("still", "i8"),  # of forces across the thrust axis: 1 the air was still, -1 it was not, 0 not looked at
                 # faults of the model that last: bits by axis, then by rotor, and sizes
                 ("wrong", "i8"),
                 ("was", "f8", 14),
