@@ -146,10 +146,11 @@ def test_transition_is_the_derivative_of_the_motion(seed: int) -> None:
     for dt in (1e-2, 1e-3):
         keep = float(np.exp(-dt / 3.0))
         middle = _step(x, M, dt, keep)
-        numeric = np.column_stack(
-            [(_error(_step(_with_error(x, h * e), M, dt, keep), middle) - _error(_step(_with_error(x, -h * e), M, dt, keep), middle)) / (2 * h)
-             for e in np.eye(22)]
-        )  # fmt: skip
+
+        def moved(e: FloatArray, x: Any = x, middle: Any = middle, dt: float = dt, keep: float = keep) -> FloatArray:
+            return _error(_step(_with_error(x, e), M, dt, keep), middle)
+
+        numeric = np.column_stack([(moved(h * e) - moved(-h * e)) / (2 * h) for e in np.eye(22)])
         A = _dense(_transition(x, M, dt, keep))
         assert np.array_equal(A[22:, 22:], np.eye(3)) and not A[:22, 22:].any() and not A[22:, :22].any()
         errors.append(np.abs(A[:22, :22] - numeric).max())
