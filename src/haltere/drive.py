@@ -112,6 +112,10 @@ def run(
     asked = request(flight, estimator, preset, config, set)
     if smooth and asked["magnetometer.refine"] == "on":
         raise UsageError("magnetometer.refine=off with a smoothed run", "on", "--smooth", "the smoother does not know those states yet")
+    if smooth and model is not None:
+        raise UsageError(
+            "a smoothed run without a vehicle's model", str(vehicle)[:60], "--smooth", "the smoother does not know its states yet"
+        )
     attitude_only = asked["wind_attitude.filter"] == "quaternion"
     if smooth and attitude_only:
         raise UsageError("no smoothing of the published filter", f"{estimator}, preset {preset}", "--smooth", "preset default has it")
@@ -384,6 +388,7 @@ _OPTIONAL = {
     "drag": ("drag_mu", "drag_c", "drag_offset_x", "drag_offset_y"),
     "steady": ("", ""),
     "vane": ("airspeed_scale", "aoa_offset", "sideslip_offset"),
+    "twist": ("", "", ""),
 }
 _LOGARITHMIC = ("drag_mu", "drag_c", "airspeed_scale")
 

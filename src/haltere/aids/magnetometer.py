@@ -84,6 +84,12 @@ def reset_yaw(s: Any, delta: float, sd: float) -> None:
 
 
 @jit
+def rate_is_modelled(s: Any) -> bool:
+    """Whether a vehicle's model stands in for an axis of the gyro."""
+    return len(s.pairs) > 0 and (s.pairs[0].on[0] | s.pairs[0].on[1] | s.pairs[0].on[2]) != 0
+
+
+@jit
 def offer(s: Any, prm: Any, m: Any, aids: Any) -> Offer:
     """Magnetometer sample ``m.z`` [uT, body]. Starts by setting yaw where that is unknown, then heading or three axes."""
     z = (m.z[0], m.z[1], m.z[2])
@@ -121,7 +127,7 @@ def offer(s: Any, prm: Any, m: Any, aids: Any) -> Offer:
             return NOTHING
     unsure = interference.unsure(s)
     timeout = prm.timeout_magnetometer
-    if prm.aid_compass_watch > 0.0 and a.started > 0:
+    if prm.aid_compass_watch > 0.0 and a.started > 0 and not rate_is_modelled(s):  # which would be taken for the compass' own turning
         timeout = NO_TIMEOUT  # the watch says when the compass is to be heard again
         if reason == R_NONE:
             weight, reason = compass.level(s, prm, strength, dip, m.t - s.compass.t_last)
@@ -142,7 +148,7 @@ def offer(s: Any, prm: Any, m: Any, aids: Any) -> Offer:
     r = (white + slow) / max(horizontal * horizontal, 1e-6)
     return (
         ONE, C_HEADING, (heading, 0.0, 0.0), (0.0, 0.0, 0.0), (r, r, r), (row, row, row), prm.gate_magnetometer, timeout,
-        reason, ONLY_TURN, robust,
+        reason, ANY_TURN if rate_is_modelled(s) else ONLY_TURN, robust,
     )  # fmt: skip
 
 

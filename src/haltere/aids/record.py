@@ -126,6 +126,8 @@ def event_since(s: Any, t: float, onset: float, code: int, sensor: int, value: f
         e = s.event[i]
         e.t, e.onset, e.code, e.sensor, e.value, e.threshold, e.detail = t, onset, code, sensor, value, threshold, detail
         e.seen, e.size, e.sd, e.candidates, e.left = t, math.nan, math.nan, 0, math.nan
+        for k in range(6):
+            e.alarms[k] = math.nan
         s.n_events = i + 1
     else:
         s.n_events_lost += 1

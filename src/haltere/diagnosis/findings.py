@@ -8,6 +8,8 @@ from typing import Any
 import numpy as np
 
 from haltere.diagnosis.inertial import FAMILIES
+from haltere.diagnosis.model_faults import MODEL
+from haltere.diagnosis.model_findings import of_the_model
 from haltere.diagnosis.steps import DEATHS, STEP
 
 __all__ = ["findings"]
@@ -35,6 +37,9 @@ def _of(fault: int) -> tuple[int, tuple[str, str, float]]:
 
 def findings(kind: str, record: np.void, events: list[dict[str, Any]]) -> None:
     """Append a finding to the events, or complete the one that told of it before as one of several."""
+    if int(record["detail"]) >= MODEL:
+        of_the_model(kind, record, events)
+        return
     if int(record["detail"]) >= STEP:
         _of_samples(kind, record, events)
         return

@@ -154,9 +154,11 @@ def known(s: Any) -> bool:
 
 
 @jit
-def sick(b: Any) -> bool:
-    """Whether a channel of the IMU is known to fail: then the bank has nothing to say."""
-    w = b.step.wrong
+def sick(s: Any) -> bool:
+    """Whether a channel of the IMU is known to fail, or a model stands in for one: then the bank has nothing to say."""
+    if len(s.pairs) > 0 and s.pairs[0].any != 0:
+        return True
+    w = s.bank[0].step.wrong
     return int(w[0] | w[1] | w[2] | w[3] | w[4] | w[5]) != 0
 
 
@@ -183,7 +185,7 @@ def tick(s: Any, prm: Any, dt: float) -> bool:
         b.t_doubt = max(b.t_doubt, s.t + doubt.AFTER_GAP)
     if s.t >= b.t_slot:
         b.t_slot = s.t + GRID - 1e-6
-        if known(s) and s.t > b.t_doubt and not sick(b):
+        if known(s) and s.t > b.t_doubt and not sick(s):
             if b.span > 0.0:
                 move(b)
             open_slot(s, next_slot(b, s.t), dcm((s.q[0], s.q[1], s.q[2], s.q[3]))[2])

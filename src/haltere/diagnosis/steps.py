@@ -133,9 +133,15 @@ def watch(s: Any, prm: Any, t: float, dt: float, w: Vec, f: Vec) -> bool:
             d.h_low[i, c], d.h_high[i, c], d.h_sd[i, c] = d.low[c], d.high[c], scale(d, c)
             d.low[c], d.high[c] = 0.0, 0.0
     sick(s, prm, t, dt, new)
-    if found >= 0 and not doubt.near_ground(s) and t - s.bank[0].t_contact > doubt.CONTACT:
+    if found >= 0 and not replaced(s, found) and not doubt.near_ground(s) and t - s.bank[0].t_contact > doubt.CONTACT:
         return step_of(s, found, t)
     return False
+
+
+@jit
+def replaced(s: Any, c: int) -> bool:
+    """Whether a vehicle's model stands in for a channel."""
+    return len(s.pairs) > 0 and s.pairs[0].on[c] == 1
 
 
 @jit
@@ -186,6 +192,7 @@ def step_of(s: Any, c: int, t: float) -> bool:
     s.P[c, c] += variance * (t - onset) * (t - onset)
     inject(s)
     clear(s.bank[0])
+    s.bank[0].healed += 1
     s.bank[0].yaw = s.yaw_corrected
     compass.forget(s)
     for a in range(6):  # the history is that of the failed sensor: it proves nothing any more
@@ -244,7 +251,7 @@ def sick(s: Any, prm: Any, t: float, dt: float, new: tuple[float, float, float, 
                 fail(s, c, NOISE, t, d.t_rough[c], ratio, ROUGH)
         elif d.wrong[c] == NOISE and ratio < 0.5 * ROUGH:
             over(s, c, t)
-        if d.wrong[c] != 0:
+        if d.wrong[c] != 0 and not replaced(s, c):
             unsure(s, c, dt)
 
 

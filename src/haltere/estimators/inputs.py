@@ -26,8 +26,10 @@ from haltere.aids.record import (
     WIND,
 )
 from haltere.core.earth import pressure_altitude
+from haltere.diagnosis.pairs import BLOCK
 from haltere.errors import UsageError
 from haltere.estimators.air import air_from_vanes, given_wind, steady_wind
+from haltere.filter.windows import glr_level
 from haltere.flight import config as configuration
 from haltere.flight.config import KEYS, Config
 from haltere.flight.corrections import mounted
@@ -167,7 +169,7 @@ def parameters(config: Config) -> NDArray[np.void]:
     """Parameter record, one element, of a configuration."""
     record = as_records(np.zeros(1, PARAMETERS))
     for name in PARAMETERS.names or ():
-        if name in ("horizon", "covariance_interval", "imu_mean", "diagnosis_threshold"):
+        if name in ("horizon", "covariance_interval", "imu_mean", "diagnosis_threshold", "diagnosis_pair_threshold"):
             continue
         head = next((h for h in ("two_stage", "wind_attitude", "fault_tolerant") if name.startswith(f"{h}_")), name.partition("_")[0])
         record[name] = config.number(f"{head}.{name[len(head) + 1 :]}")
@@ -175,6 +177,7 @@ def parameters(config: Config) -> NDArray[np.void]:
     record["horizon"] = horizon(config)
     record["covariance_interval"] = 0.1
     record["diagnosis_threshold"] = alarm_level(config.number("diagnosis.false_alarms"))
+    record["diagnosis_pair_threshold"] = glr_level(config.number("diagnosis.false_alarms"), 6.0 / BLOCK, 1)
     return record
 
 

@@ -12,3 +12,5 @@ NEEDS = ("imu",)
 USES = ("imu", "gnss", "magnetometer", "barometer", "power", "rotors", "airdata", "wind", "attitude")
 #: Columns of its solution beyond attitude, velocity, position and biases.
 POSITION = True
+#: Whether it uses a vehicle's model.
+VEHICLE = True

@@ -27,7 +27,7 @@ from haltere.aids.record import (
     event,
 )
 from haltere.core.rotation import Vec, cross, dcm, mat_vec, quat_from_rotvec, quat_mul
-from haltere.diagnosis import inertial, steps
+from haltere.diagnosis import inertial, model_faults, pairs, stand_in, steps
 from haltere.estimators import alignment, yaw_bank
 from haltere.filter.queue import pop_imu, push, push_imu
 from haltere.filter.rotors import push_rotors, rotors_at
@@ -306,6 +306,7 @@ def advance(s: Any, prm: Any, rows: Any, cov: Any, aids: Any, tape: Any, stage: 
         return
     s.t = t
     rest.monitor(s, prm, t, w1, f1)
+    w_raw, f_raw = w1, f1
     if s.phase == 1:
         if prm.imu_mean > 0.0:
             alignment.gather(s, prm, (w1[0] * dt, w1[1] * dt, w1[2] * dt), (f1[0] * dt, f1[1] * dt, f1[2] * dt), dt)
@@ -326,16 +327,27 @@ def advance(s: Any, prm: Any, rows: Any, cov: Any, aids: Any, tape: Any, stage: 
     else:
         node, kind = dt > LONG_STEP or t >= s.t_wake or s.n_since >= NODE_STEPS - 1 or s.n_since * dt >= NODE_SPAN, FOLLOWS
         s.n_since += 1
+        if len(s.pairs) > 0:
+            w0, f0, w1, f1 = stand_in.stand_in(s, prm, w0, f0, w1, f1, dt)
+            s.w_raw[0], s.w_raw[1], s.w_raw[2] = w1
+            s.f_raw[0], s.f_raw[1], s.f_raw[2] = f1
+            if pairs.gather(s, prm, w_raw, f_raw, dt) and pairs.listen(s, prm):
+                model_faults.judge(s, prm)
         north, east = s.v[0], s.v[1]
         if dt > LONG_STEP:
             bridge_gap(s, stage, prm, w0, f0, w1, f1, dt)
         else:
             predict_interval(s, prm, w0, f0, w1, f1, dt)
             predict_stage(s, stage, prm, w0, f0, w1, f1, dt)
+        if len(s.pairs) > 0 and stand_in.stands(s):
+            stand_in.couple(s, prm, dt)
         s.yaw.dv[0] += s.v[0] - north
         s.yaw.dv[1] += s.v[1] - east
         if len(s.drag) > 0:
-            drag.gather(s, f1, dt)
+            if len(s.pairs) > 0 and stand_in.across(s):
+                s.air.dt = 0.0  # no drag is measured
+            else:
+                drag.gather(s, f1, dt)
         if t >= s.t_wake:
             for part in range(2):  # what is measured, then what is assumed; one call, since with a second one it is compiled twice
                 if part == 1 and fake.blind_to_heading(s, prm):
@@ -347,7 +359,7 @@ def advance(s: Any, prm: Any, rows: Any, cov: Any, aids: Any, tape: Any, stage: 
                     if prm.aid_yaw_bank > 0.0:
                         yaw_bank.update(s, s.yaw.z[0], s.yaw.z[1], s.yaw.r)
         if len(s.bank) > 0:
-            found = steps.watch(s, prm, t, dt, w1, f1)
+            found = steps.watch(s, prm, t, dt, w_raw, f_raw)
             if inertial.tick(s, prm, dt) or found:  # what was before is smoothed by itself
                 node, kind = True, BEGINS
     if t >= s.t_covariance and not sound(s):
@@ -556,6 +568,8 @@ def now(S: Any, PRM: Any, out: Any) -> None:
     for i in range(s.imu_n):
         m = s.imu[(s.imu_head + i) % len(s.imu)]
         w1, f1 = (m.w[0], m.w[1], m.w[2]), (m.f[0], m.f[1], m.f[2])
+        if len(s.pairs) > 0:
+            w1, f1 = stand_in.hold(s, w0, f0, w1, f1)
         dt = m.t - t
         k = 1.0 if prm.imu_mean > 0.0 else 0.5
         w = (

@@ -301,6 +301,11 @@ KEYS: dict[str, Key] = {
     ),
     "fault_tolerant.wait": Key(2.5, "s", "How long alarms are gathered before a verdict.", low=0.1, high=10.0),
     "fault_tolerant.recover": Key(5.0, "s", "How long an isolated sensor must agree again before it is heard.", low=0.5, high=60.0),
+    "diagnosis.vehicle": switch(
+        "on", "With a vehicle's model: compare it with gyro and accelerometer, and name a rotor or an axis of the model that fails."
+    ),
+    "diagnosis.force": Key(0.2, "m/s^2", "Change of what the model's force is off by that is no fault.", low=0.0),
+    "diagnosis.moment": Key(0.5, "rad/s^2", "The same of its moments.", low=0.0),
     "exclude.gyro": exclusion("Gyro axes that are not to be used, and when: a sensor known to be broken, or a trial without it."),
     "exclude.accel": exclusion("The same of the accelerometer."),
     "imu.kind": switch("instant", "An IMU sample is the value at its time, or the mean since the sample before.", ("instant", "mean")),
@@ -408,7 +413,7 @@ _QUATERNION = (
 )  # fmt: skip
 #: Keys that an estimator does not have: changing them would change nothing, or make it another one.
 _FIXED: dict[str, tuple[str, ...]] = {
-    "navigator": (*_TWO_STAGE, *_WIND_ATTITUDE, *_GIVEN_WIND, *_FAULT_TOLERANT, *_EXCLUDE),
+    "navigator": (*_TWO_STAGE, *_WIND_ATTITUDE, *_GIVEN_WIND, *_FAULT_TOLERANT),
     "fault-tolerant": (*_TWO_STAGE, *_WIND_ATTITUDE, *_GIVEN_WIND, *_NO_AIR, "magnetometer.refine"),
     "ahrs": (*_OVERRIDES["ahrs"], *_TWO_STAGE, *_AIR, *_WIND_ATTITUDE, *_DIAGNOSIS, *_FAULT_TOLERANT, *_EXCLUDE),
     "wind-attitude": (*_TWO_STAGE, *_DIAGNOSIS, *_FAULT_TOLERANT, *_EXCLUDE, "wind_attitude.filter"),

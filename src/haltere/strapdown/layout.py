@@ -14,6 +14,7 @@ import numpy as np
 from haltere._jit import constant
 from haltere.core.lumped import lumped_layout
 from haltere.strapdown.bank import bank
+from haltere.strapdown.pairs import pairs
 
 __all__ = [
     "AID_STATE",
@@ -238,6 +239,7 @@ EVENT = _record(
     ("sd", "f8"),
     ("candidates", "i8"),
     ("left", "f8"),  # what it leaves unexplained, as a part of what it explains
+    ("alarms", "f8", 6),  # when each pair of model and IMU alarmed [s], NaN: not
 )
 
 #: A first stage: the part of a state that prediction and updates touch, with the core states only.
@@ -254,6 +256,8 @@ STAGE = _record(
     ("drag", "f8", (0,)),
     ("steady", "f8", (0,)),
     ("vane", "f8", (0,)),
+    ("twist", "f8", (0,)),
+    ("pairs", pairs(), (0,)),
     ("P", "f8", (CORE, CORE)),
     ("dx", "f8", CORE),
     ("u", "f8", CORE),
@@ -294,6 +298,7 @@ PARAMETERS = np.dtype(
             "two_stage_radial two_stage_memory "
             "two_stage_haversine two_stage_height_sign "
             "diagnosis_inertial diagnosis_gyro diagnosis_accel diagnosis_threshold "
+            "diagnosis_vehicle diagnosis_force diagnosis_moment diagnosis_pair_threshold "
             "wind_attitude_integrator wind_attitude_residual wind_attitude_rows wind_attitude_normalise wind_attitude_angles "
             "wind_attitude_accel wind_attitude_force wind_attitude_acceleration wind_attitude_gate wind_attitude_air "
             "fault_tolerant_detector fault_tolerant_reset fault_tolerant_wind fault_tolerant_biases fault_tolerant_isolate "
@@ -308,7 +313,7 @@ PARAMETERS = np.dtype(
 @cache
 def layout(
     baro: int = 0, mag: int = 0, stages: int = 0, wind: int = 0, drag: int = 0, vane: int = 0, banks: int = 0,
-    rotors: int = 0, beside: np.dtype[np.void] | None = None,
+    rotors: int = 0, twist: int = 0, beside: np.dtype[np.void] | None = None,
 ) -> np.dtype[np.void]:  # fmt: skip
     """State record type.
 
@@ -330,6 +335,8 @@ def layout(
         1 with the memory of diagnosis, else 0.
     rotors
         Number of rotors of the vehicle's model, 0 without one.
+    twist
+        3 with the offset of that model's moments as states, and all that lets it stand in for axes of the IMU, else 0.
     beside
         Record type of what an estimator remembers beside all this (`fault-tolerant`); None for nothing.
 
@@ -338,7 +345,7 @@ def layout(
     numpy.dtype
         Nominal state, covariance ``P`` (n, n), scratch, queues, monitors and counters: the whole memory of a filter.
     """
-    n = CORE + baro + mag + (wind + 2 if wind else 0) + drag + vane
+    n = CORE + baro + mag + (wind + 2 if wind else 0) + drag + vane + twist
     return np.dtype(
         [
             ("t", "f8"),
@@ -353,6 +360,7 @@ def layout(
             ("drag", "f8", (drag,)),  # ln mu [1/s], ln c [1/m], offset of the thrust's axis along x and y [m/s^2]
             ("steady", "f8", (2 if wind else 0,)),  # what the wind returns to after gusts, likewise
             ("vane", "f8", (vane,)),  # ln of the airspeed's scale, offsets of angle of attack and sideslip [rad]
+            ("twist", "f8", (twist,)),  # what the moments of the vehicle's model lack [rad/s^2]
             ("P", "f8", (n, n)),
             ("dx", "f8", n),
             ("u", "f8", n),
@@ -402,6 +410,7 @@ def layout(
             ("bank", bank(n), (banks,)),
             *_of_rotors(rotors),
             ("ft", _record(("on", "i8")) if beside is None else beside, (0 if beside is None else 1,)),
+            ("pairs", pairs(), (1 if twist else 0,)),
             ("ring_head", "i8", N_QUEUES),
             ("ring_n", "i8", N_QUEUES),
             ("ring", MEASUREMENT, (N_QUEUES, MEASUREMENT_CAPACITY)),

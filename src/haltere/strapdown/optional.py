@@ -29,6 +29,9 @@ def get_optional(s: Any, x: Any, k: int) -> None:
     k += len(s.steady)
     for i in range(len(s.vane)):
         x[k + i] = s.vane[i]
+    k += len(s.vane)
+    for i in range(len(s.twist)):
+        x[k + i] = s.twist[i]
 
 
 @jit
@@ -46,6 +49,8 @@ def put_optional(s: Any, x: Any, k: int) -> None:
         s.steady[i] = 0.0
     for i in range(len(s.vane)):
         s.vane[i] = 0.0
+    for i in range(len(s.twist)):
+        s.twist[i] = 0.0
     add_optional(s, x, k)
 
 
@@ -69,3 +74,6 @@ def add_optional(s: Any, x: Any, k: int) -> None:
     k += len(s.steady)
     for i in range(len(s.vane)):
         s.vane[i] += x[k + i]
+    k += len(s.vane)
+    for i in range(len(s.twist)):
+        s.twist[i] += x[k + i]

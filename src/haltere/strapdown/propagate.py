@@ -13,7 +13,7 @@ from haltere.core.rotation import Mat, Vec, cross, dcm, dot, mat_vec, quat_from_
 from haltere.filter.update import symmetrise
 from haltere.strapdown.optional import add_optional
 
-__all__ = ["gust_keeps", "inject", "left_F", "mechanise", "predict", "propagate", "transition", "turn", "unseen"]
+__all__ = ["gust_keeps", "gusts", "inject", "left_F", "mechanise", "predict", "propagate", "transition", "turn", "unseen"]
 
 
 @jit
@@ -222,6 +222,17 @@ def gust_keeps(prm: Any, dt: float) -> float:
 
 
 @jit
+def gusts(s: Any, prm: Any) -> tuple[float, float]:
+    """1 sigma of gusts, and how the mean wind walks [1/sqrt(s)], in the units of the wind's states."""
+    speed, factor = math.sqrt(s.steady[0] * s.steady[0] + s.steady[1] * s.steady[1]), 1.0
+    if len(s.drag) > 0:
+        mu, c = math.exp(s.drag[0]), math.exp(s.drag[1])
+        factor = math.sqrt(mu * mu + 4.0 * c * speed)  # µ + 2c|W|
+        speed = 2.0 * speed / (mu + factor)
+    return factor * (prm.air_gust + prm.air_turbulence * speed), factor * prm.noise_wind_mean
+
+
+@jit
 def blow(s: Any, prm: Any, o: int, dt: float) -> None:
     """Advance wind and coefficients of the air, from error state ``o`` on.
 
@@ -233,12 +244,9 @@ def blow(s: Any, prm: Any, o: int, dt: float) -> None:
     P, n = s.P, s.P.shape[0]
     first, keep = o + len(s.wind), gust_keeps(prm, dt)
     m = first + len(s.drag)
-    speed, factor = math.sqrt(s.steady[0] * s.steady[0] + s.steady[1] * s.steady[1]), 1.0
-    if len(s.drag) > 0:
-        mu, c = math.exp(s.drag[0]), math.exp(s.drag[1])
-        factor = math.sqrt(mu * mu + 4.0 * c * speed)  # µ + 2c|W|
-        speed = 2.0 * speed / (mu + factor)
-    gust, walk = factor * (prm.air_gust + prm.air_turbulence * speed), factor * prm.noise_wind_mean
+    gust, walk = gusts(s, prm)
+    if len(s.pairs) > 0 and (s.pairs[0].on[3] | s.pairs[0].on[4]) != 0:
+        gust *= s.pairs[0].calm  # no drag is measured: gusts are those of the flight so far
     for i in range(len(s.wind)):
         if i < 2:
             s.wind[i] = keep * s.wind[i] + (1.0 - keep) * s.steady[i]
@@ -259,7 +267,7 @@ def blow(s: Any, prm: Any, o: int, dt: float) -> None:
         P[o + i, o + i] += k * k * (1.0 - keep * keep)
     for i in range(2):
         P[m + i, m + i] += walk * walk * dt
-    for i in range(first, n):
+    for i in range(first, n - len(s.twist)):
         if i < m or i >= m + 2:
             P[i, i] += prm.noise_air_walk * prm.noise_air_walk * dt
 

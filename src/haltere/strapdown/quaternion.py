@@ -29,7 +29,7 @@ def quaternion_layout() -> np.dtype[np.void]:
             ("t", "f8"),
             ("x", "f8", 4),  # the filter's state
             ("q", "f8", 4),  # the attitude that it gives out: of length one
-            *((name, "f8", (0,)) for name in ("v", "p", "bg", "ba", "baro", "mag", "wind", "drag", "steady", "vane")),
+            *((name, "f8", (0,)) for name in ("v", "p", "bg", "ba", "baro", "mag", "wind", "drag", "steady", "vane", "twist")),
             ("P", "f8", (4, 4)),
             ("work", "f8", (3, 4, 4)),
             ("w_raw", "f8", 3),

@@ -1,0 +1,228 @@
+"""Residuals of a vehicle's model against its IMU, whitened, and when they alarm: the detectors J11 to J16. It names nothing.
+
+J11-J13 compare specific force, J14-J16 angular rate (theory.md §5.4, theory-amendments.md 2, 4, 5) in blocks of a hundredth of a second.
+Biases are the filter's of 5 s before, held while an alarm is pending. The chain of a force is its offset b_F, a walk; that of a moment is
+the rate and the offset b_M. Its innovations, over what they come to in this flight and less what follows from the one before, go into a
+GLR over windows of 1 to 512 blocks. Its threshold is that of a rate of false alarms, raised by what the statistic usually comes to, as
+for the bank of `haltere.diagnosis.inertial`: one stretch late, so that a fault does not raise its own.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+from haltere._jit import constant, jit
+from haltere.core.rotation import Vec
+from haltere.diagnosis.stand_in import across, density_of_noise, mark_before, offset_variance
+from haltere.filter.windows import empty, take
+from haltere.strapdown.pairs import MARKS
+from haltere.strapdown.propagate import gusts
+
+__all__ = ["BLOCK", "calm_again", "change", "gather", "listen", "restart"]
+
+#: A block, and time between marks of the past [s].
+BLOCK, MARK = 0.01, 0.25
+#: Biases are held for so long [s]; blocks until a chain is known; time in the air before [s].
+HELD, WARM, AIRBORNE = 5.0, 200, 2.0
+#: An offset walks by its 1 sigma in this time [s]; 1 sigma of one that begins anew, in those.
+WALK, ANEW = 5.0, 10.0
+#: Memory of what innovations come to, and of the noise of a block, in blocks; how far a lone one may move it.
+LEARN, NOISE, LONE = 2000.0, 500.0, 9.0
+#: Most correlation of neighbours that is taken out.
+MOST_RHO = 0.9
+#: As in `haltere.diagnosis.inertial`: over how many usual ones a threshold is, stretch [s], how fast that is learnt, its bound.
+BEYOND_USUAL, STRETCH, RISE, FALL, CAP = 2.0, 10.0, 0.6, 0.1, 2.0
+#: Memory of gusts [s].
+STIR = 20.0
+#: A wind that changed, or was taken for one, is found again and again for so long [s]: forces are not judged meanwhile.
+FOLLOWS = 15.0
+#: Least part of the gusts expected that are taken for there.
+CALMEST = 0.2
+FORCES, AXES = constant(3), constant(6)
+
+
+@jit
+def calm_again(s: Any, i: int) -> None:
+    """Begin the chain of a pair anew: whatever its offset is now is what it is compared with."""
+    p = s.pairs[0]
+    v = offset_variance(s, i) * ANEW * ANEW
+    p.P[i, 0], p.P[i, 1], p.P[i, 2] = v if i < FORCES else 1.0, 0.0, v
+    p.z[i], p.t_alarm[i], p.n_blocks = 0.0, 0.0, 0
+    empty(p.w[i])
+
+
+@jit
+def gather(s: Any, prm: Any, w: Vec, f: Vec, dt: float) -> bool:
+    """Take a raw sample; True at the end of a block, when `listen` has something to hear."""
+    p = s.pairs[0]
+    if p.flying == 0 or s.rotor_known == 0 or prm.diagnosis_vehicle == 0.0:
+        if p.n_blocks > 0 or p.span > 0.0:
+            restart(s)
+        return False
+    if s.t >= p.t_bias and p.t_first == 0.0:
+        use_bias(s)
+    for i in range(3):
+        p.sum[i] += (f[0], f[1], f[2])[i] - p.bias[i] - p.f[i]
+        p.sum[3 + i] += (w[0], w[1], w[2])[i] - p.bias[3 + i] - p.turn[i]
+    p.n += 1.0
+    p.span += dt
+    return p.span >= BLOCK - 0.4 * dt
+
+
+@jit
+def use_bias(s: Any) -> None:
+    """Go on with the biases of `HELD` before; levels are those of the biases in use."""
+    p = s.pairs[0]
+    begins = p.t_bias < 0.0
+    p.t_bias = s.t + HELD
+    for i in range(AXES):
+        new = s.ba[i] if i < FORCES else s.bg[i - 3]
+        used = new if begins else p.next[i]
+        p.next[i] = new
+        shift = used - p.bias[i]
+        p.bias[i] = used
+        p.level[i] -= shift
+        p.before[i] -= shift
+        for k in range(MARKS):
+            p.m_level[k, i] -= shift
+
+
+@jit
+def restart(s: Any) -> None:
+    """Forget chains and alarms: on the ground, without rotor speeds, after alignment."""
+    p = s.pairs[0]
+    p.t_across = -1e9
+    p.n, p.span, p.t_first, p.t_bias, p.stir, p.calm = 0.0, 0.0, 0.0, -1e9, 1.0, 1.0
+    for i in range(6):
+        p.sum[i], p.drift[i], p.level[i], p.early[i], p.told_size[i] = 0.0, 0.0, 0.0, math.nan, 0.0
+        calm_again(s, i)
+    for k in range(MARKS):
+        p.m_t[k] = -1e9
+
+
+@jit
+def chain(s: Any, i: int, y: float, dt: float) -> float:
+    """Take a block's residual into the chain of a pair; the innovation in its own sigma."""
+    p = s.pairs[0]
+    q = offset_variance(s, i) / WALK * dt
+    if i < FORCES:
+        p.P[i, 0] += q
+        S = p.P[i, 0] + p.r[i]
+        k = p.P[i, 0] / S
+        e = y - p.level[i]
+        p.level[i] += k * e
+        p.P[i, 0] *= 1.0 - k
+    else:
+        p.level[i] += dt * p.drift[i]
+        p.P[i, 0] += dt * (2.0 * p.P[i, 1] + dt * p.P[i, 2]) + density_of_noise(s, i) * dt
+        p.P[i, 1] += dt * p.P[i, 2]
+        p.P[i, 2] += q
+        S = p.P[i, 0] + p.r[i]
+        k, g = p.P[i, 0] / S, p.P[i, 1] / S
+        e = y - p.level[i]
+        p.level[i] += k * e
+        p.drift[i] += g * e
+        p.P[i, 2] -= g * p.P[i, 1]
+        p.P[i, 1] *= 1.0 - k
+        p.P[i, 0] *= 1.0 - k
+    p.sd[i] = math.sqrt(S)
+    return e / p.sd[i]
+
+
+@jit
+def size_of(p: Any, i: int, rho: float, dt: float) -> float:
+    """Size of what is in the window that says most: a force, or a moment from the innovations it makes in a settled chain."""
+    w = p.w[i]
+    e = w.mean[0] * math.sqrt((1.0 + rho) / (1.0 - rho) * p.c0[i]) * p.sd[i]
+    return e if i < FORCES else e * p.P[i, 0] / p.r[i] / dt  # a settled chain follows with its gain, P/r, of the innovation a block
+
+
+@jit
+def listen(s: Any, prm: Any) -> bool:
+    """Take the block that has ended into every detector; True while an alarm is pending."""
+    p = s.pairs[0]
+    dt, n = p.span, p.n
+    p.n, p.span = 0.0, 0.0
+    first = p.n_blocks == 0
+    p.n_blocks += 1
+    learns = p.t_first == 0.0
+    for i in range(AXES):
+        y = p.sum[i] / n
+        p.sum[i] = 0.0
+        if first:
+            p.level[i] = y
+            p.before[i] = y
+            if p.r[i] <= 0.0:
+                p.r[i] = 1e-3 if i >= FORCES else 0.3
+                p.c0[i], p.c1[i] = 1.0, 0.0
+            continue
+        d = y - p.before[i]
+        p.before[i] = y
+        p.r[i] += (min(0.5 * d * d, LONE * p.r[i]) - p.r[i]) / NOISE
+        z = chain(s, i, y, dt)
+        if p.n_blocks < WARM // 2:
+            continue
+        if learns:
+            a = min(z * z, LONE * p.c0[i])
+            p.c0[i] += (a - p.c0[i]) / LEARN
+            p.c1[i] += (min(max(z * p.z[i], -LONE * p.c0[i]), LONE * p.c0[i]) - p.c1[i]) / LEARN
+        p.z[i] = z
+        rho = min(max(p.c1[i] / p.c0[i], 0.0), MOST_RHO)
+        glr = take(p.w[i], (z / math.sqrt(p.c0[i]), 0.0, 0.0), 1, rho)
+        over = glr / prm.diagnosis_pair_threshold
+        p.peak[i] = max(p.peak[i], over)
+        if p.on[3 + i if i < FORCES else i - 3] == 1 or p.n_blocks < WARM or s.t - p.t_flying < AIRBORNE:
+            continue
+        if i < FORCES and p.t_first == 0.0 and s.t - p.t_across < FOLLOWS:
+            continue
+        factor = max(1.0, BEYOND_USUAL * p.usual[i])
+        if over > factor and p.t_alarm[i] == 0.0:
+            size = size_of(p, i, rho, dt)
+            if abs(size) > (prm.diagnosis_force if i < FORCES else prm.diagnosis_moment):
+                p.t_alarm[i], p.told_size[i] = s.t, size
+                if p.t_first == 0.0:
+                    p.t_first, p.onset = s.t, s.t - p.w[i].window * BLOCK
+                    p.statistic, p.threshold = glr, factor * prm.diagnosis_pair_threshold
+                    p.mark = mark_before(p, p.onset - 2.0 * BLOCK)
+                    p.healed = s.bank[0].healed if len(s.bank) > 0 else 0
+    if s.t >= p.t_usual:
+        p.t_usual = s.t + STRETCH
+        for i in range(AXES):
+            p.usual[i] += (RISE if p.waiting[i] > p.usual[i] else FALL) * (p.waiting[i] - p.usual[i])
+            p.waiting[i] = min(p.peak[i], CAP)
+            p.peak[i] = 0.0
+    if s.t >= p.t_mark and p.t_first == 0.0 and p.n_blocks > WARM // 2:
+        remember(s, prm)
+    return p.t_first != 0.0
+
+
+@jit
+def remember(s: Any, prm: Any) -> None:
+    """Mark the past: what the chains are now."""
+    p = s.pairs[0]
+    p.t_mark = s.t + MARK
+    k = p.head
+    p.head = (k + 1) % MARKS
+    p.m_t[k] = s.t
+    for i in range(6):
+        p.m_level[k, i], p.m_drift[k, i], p.m_var[k, i] = p.level[i], p.drift[i], p.P[i, 0]
+    for i in range(3):
+        p.m_turn[k, i] = p.turn[i]
+    if len(s.wind) > 0 and not across(s):
+        gust, _ = gusts(s, prm)
+        blown = 0.0
+        for i in range(2):
+            blown += 0.5 * (s.wind[i] - s.steady[i]) * (s.wind[i] - s.steady[i])
+        p.stir += MARK / STIR * (blown / (gust * gust) - p.stir)
+        p.calm = math.sqrt(min(max(p.stir, CALMEST * CALMEST), 1.0))
+
+
+@jit
+def change(s: Any, i: int) -> float:
+    """What the level of a pair has changed by since before the alarm: a force [m/s^2], or a rate that the model did not make [rad/s]."""
+    p = s.pairs[0]
+    k = p.mark
+    if k < 0:
+        return math.nan
+    return float(p.level[i] - p.m_level[k, i] - (p.m_drift[k, i] * (s.t - p.m_t[k]) if i >= FORCES else 0.0))

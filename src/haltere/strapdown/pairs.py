@@ -1,0 +1,101 @@
+"""What a filter remembers of a vehicle's model beside its IMU: what stands in for failed axes, residuals of the pairs. No arithmetic."""
+
+from __future__ import annotations
+
+from functools import cache
+
+import numpy as np
+
+from haltere._jit import constant
+from haltere.filter.windows import windows
+
+__all__ = ["MARKS", "PAIR_WINDOW", "pairs"]
+
+#: Longest window of the detectors in blocks of a hundredth of a second, in a plain number: it is a modulus.
+PAIR_WINDOW = constant(512)
+#: Quarters of a second that the past of each pair is kept.
+MARKS = constant(40)
+
+
+@cache
+def pairs() -> np.dtype[np.void]:
+    """Record type; channels are in the order of the model's axes: force along x, y, z, moment about x, y, z."""
+    return np.dtype(
+        (
+            np.record,
+            [
+                # axes told not to be used: bits, start, end [s], of gyro and accelerometer; axes that the model stands in for
+                ("told", "f8", (2, 4, 3)),
+                ("on", "i8", 6),
+                ("any", "i8"),
+                ("kept", "f8", 6),  # bias of an axis as it was before
+                ("flying", "i8"),
+                ("t_flying", "f8"),  # since when
+                ("ground", "f8"),  # height down [m] where it last rested
+                ("ratio", "f8"),  # air density over that of the constants, and until when that holds
+                ("t_ratio", "f8"),
+                # the model at the last sample [m/s^2, rad/s^2] and its slopes: of force and of moment by air velocity, of moment by rate
+                ("f", "f8", 3),
+                ("m", "f8", 3),
+                ("v_a", "f8", 3),
+                ("by_v", "f8", (2, 3, 3)),
+                ("by_w", "f8", (3, 3)),
+                ("turn", "f8", 3),  # integral of the model's moment [rad/s]
+                ("t", "f8"),
+                # biases that residuals are free of: in use, and the ones to come
+                ("bias", "f8", 6),
+                ("next", "f8", 6),
+                ("t_bias", "f8"),
+                # block of samples: residual sums, number, when it ends
+                ("sum", "f8", 6),
+                ("n", "f8"),
+                ("span", "f8"),
+                ("t_block", "f8"),
+                # chain of each pair: level (of a force its offset, of a moment the rate less `turn`), drift of it, covariance
+                ("level", "f8", 6),
+                ("drift", "f8", 6),
+                ("P", "f8", (6, 3)),
+                ("sd", "f8", 6),
+                ("n_blocks", "i8"),
+                # innovations: variance against the expected one, product of neighbours, both learnt; measurement variance of a block
+                ("c0", "f8", 6),
+                ("c1", "f8", 6),
+                ("z", "f8", 6),
+                ("r", "f8", 6),
+                ("before", "f8", 6),
+                ("w", windows(int(PAIR_WINDOW)), (6,)),
+                # statistic over threshold: largest of this stretch and of the one before, what is usual
+                ("peak", "f8", 6),
+                ("waiting", "f8", 6),
+                ("usual", "f8", 6),
+                ("t_usual", "f8"),
+                # an alarm: when each pair gave it first (0: not), the first of all and its onset, size as the window had it
+                ("t_alarm", "f8", 6),
+                ("t_first", "f8"),
+                ("onset", "f8"),
+                ("told_size", "f8", 6),
+                ("statistic", "f8"),
+                ("threshold", "f8"),
+                ("mark", "i8"),
+                ("early", "f8", 6),  # change of the levels since the onset, soon after it
+                ("t_across", "f8"),  # last verdict on forces across the thrust axis was pending
+                ("healed", "i8"),
+                ("still", "i8"),  # of forces across the thrust axis: 1 the air was still, -1 it was not, 0 not looked at
+                # faults of the model that last: bits by axis, then by rotor, and sizes
+                ("wrong", "i8"),
+                ("was", "f8", 14),
+                # gusts lately against those the filter expects
+                ("stir", "f8"),
+                ("calm", "f8"),
+                # marks of the past: time, level, drift, turn
+                ("head", "i8"),
+                ("t_mark", "f8"),
+                ("m_t", "f8", int(MARKS)),
+                ("m_level", "f8", (int(MARKS), 6)),
+                ("m_drift", "f8", (int(MARKS), 6)),
+                ("m_turn", "f8", (int(MARKS), 3)),
+                ("m_var", "f8", (int(MARKS), 6)),
+            ],
+        ),
+        align=True,
+    )
