@@ -25,7 +25,7 @@ HEAVY = ("numba", "plotly", "polars", "scipy")
 
 #: What a kernel module may import besides its own tower: what compiles, and what only types and caches layouts.
 KERNEL_IMPORTS = {"__future__", "collections.abc", "functools", "math", "numpy", "numpy.typing", "typing"}
-KERNEL_ROOMS = ("core", "filter", "strapdown", "aids", "diagnosis")
+KERNEL_ROOMS = ("core", "filter", "vehicle", "strapdown", "aids", "diagnosis")
 
 
 def _name(path: Path) -> str:
