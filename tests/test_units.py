@@ -13,7 +13,7 @@ from haltere.errors import HaltereError
 from haltere.flight.corrections import on_unit
 from haltere.flight.log import FlightLog, Stream
 from haltere.metrics.faults import apart
-from haltere.metrics.units import agreement, contradicted, part, stations
+from haltere.metrics.units import agreement, part, stations
 from haltere.report import page
 from haltere.simulate import Scenario, inject, simulate
 
@@ -75,13 +75,13 @@ def test_of_three_the_one_apart_is_named_at_once() -> None:
         assert "agree" in event["evidence"] or "alike" in event["evidence"]
 
 
-def test_a_unit_that_measures_the_same_contradicts() -> None:
-    flight = with_second(simulate(Scenario(mission="lissajous", duration=60.0, seed=2)), 2)
-    said = {"sensor": "gyro", "axis": "x", "t_onset": 40.0, "t_detected": 42.0}
-    assert contradicted(flight, said, np.radians(3.0)) == "imu.1"
-    assert contradicted(inject(flight, ["gyro.x:bias=3deg/s@40"]), said, np.radians(3.0)) == ""
-    assert contradicted(flight, said, np.radians(0.05)) == ""  # too small to tell
+def test_what_the_second_unit_saw_is_told_of_a_finding() -> None:
+    flight = inject(with_second(simulate(Scenario(mission="lissajous", duration=60.0, seed=2)), 2), ["gyro.x:bias=5deg/s@40"])
+    change, sd = agreement(flight, "imu.1", 0, 40.0, 43.0) or (0.0, 0.0)
+    assert change == pytest.approx(np.radians(5.0), abs=4.0 * sd + np.radians(0.3))
     assert agreement(flight, "imu.1", 0, 1.0, 2.0) is None
+    (event,) = of_units(haltere.run(flight, set={"diagnosis.inertial": "on"}))
+    assert "imu.1" in event["evidence"]
 
 
 def test_another_unit_can_be_used(tmp_path: Path) -> None:

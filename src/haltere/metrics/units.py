@@ -19,7 +19,7 @@ from haltere.flight.log import FlightLog, Stream
 from haltere.flight.schema import base_name
 from haltere.metrics.magnetism import clean
 
-__all__ = ["Apart", "agreement", "better", "contradicted", "events", "part", "stations"]
+__all__ = ["Apart", "agreement", "better", "events", "part", "stations"]
 
 FloatArray = NDArray[np.float64]
 
@@ -36,8 +36,8 @@ SCALE, ARM, SHAKEN = 0.01, 0.03, 0.25
 MARGIN = 30.0
 #: Units that begin to differ within so long of each other [s] differ for one reason.
 TOGETHER = 3.0
-#: A finding is contradicted by a unit that changed by less than this part of it, if it would have shown that with so many sigma.
-THIRD, SURE = 1.0 / 3.0, 3.0
+#: A third unit that changed by less than this part of a difference agrees, by more than twice as much differs too.
+THIRD = 1.0 / 3.0
 #: When the other sensors are asked, after a difference was seen [s].
 ASKED = (0.5, 1.0, 1.5, 2.0, 3.0, 5.0, 10.0)
 #: Streams slower than this [Hz] are not compared.
@@ -250,7 +250,21 @@ def events(flight: FlightLog, likelier: Likelier, told: list[dict[str, Any]]) ->
             same["evidence"] += f"; {found.other} differs from it by {_size(found)} since {found.onset:.1f} s"
             continue
         out.append(_event(found, *_bad(flight, names, found, likelier)))
+    for e in told:
+        _beside(flight, names, e)
     return out
+
+
+def _beside(flight: FlightLog, names: list[str], e: dict[str, Any]) -> None:
+    """What further units say of an axis that was named without them: whether they saw it change."""
+    axis = next((k for k, who in enumerate(AXES) if who == (e["sensor"], e["axis"])), -1)
+    if axis < 0 or e["t_isolated"] is None or "differs from it" in e["evidence"]:
+        return
+    k, unit = (math.degrees(1.0), "deg/s") if axis < 3 else (1.0, "m/s²")
+    for other in names[1:]:
+        near = agreement(flight, other, axis, e["t_onset"], max(e["t_isolated"], e["t_onset"] + 1.0))
+        if near is not None:
+            e["evidence"] += f"; beside {other} it changed by {k * near[0]:+.2g} ± {k * near[1]:.1g} {unit}"
 
 
 def _first_of_each(flight: FlightLog, names: list[str]) -> list[Apart]:
@@ -302,15 +316,3 @@ def _event(a: Apart, bad: list[str], known: float, why: str) -> dict[str, Any]:
         "t_isolated": known if math.isfinite(known) else None, "t_recovered": None, "candidates": who, "statistic": a.statistic,
         "threshold": SIGMAS, "evidence": f"imu less {a.other} changes by {_size(a)}; {why}",
     }  # fmt: skip
-
-
-def contradicted(flight: FlightLog, event: dict[str, Any], size: float) -> str:
-    """The further unit that measures the same as the first where a fault of ``size`` [rad/s, m/s^2] is said to be; empty if none does."""
-    if (event["sensor"], event["axis"]) not in AXES:
-        return ""
-    axis = AXES.index((event["sensor"], event["axis"]))
-    for other in stations(flight)[1:]:
-        near = agreement(flight, other, axis, event["t_onset"], max(event["t_detected"], event["t_onset"] + 1.0))
-        if near is not None and abs(near[0]) < THIRD * abs(size) and SURE * near[1] < (1.0 - THIRD) * abs(size):
-            return other
-    return ""
