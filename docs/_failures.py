@@ -32,7 +32,7 @@ STEP, GRAVITY = 1.0 / RATE, 9.80665
 I_BAD = int(BAD * RATE)
 FLU = np.array([1.0, -1.0, -1.0])
 #: Seconds that a library may take for all its cases.
-LIMIT = 120.0
+LIMIT = 300.0
 
 
 # The motion, NED and FRD
