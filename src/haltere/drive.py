@@ -112,10 +112,6 @@ def run(
     asked = request(flight, estimator, preset, config, set)
     if smooth and asked["magnetometer.refine"] == "on":
         raise UsageError("magnetometer.refine=off with a smoothed run", "on", "--smooth", "the smoother does not know those states yet")
-    if smooth and model is not None:
-        raise UsageError(
-            "a smoothed run without a vehicle's model", str(vehicle)[:60], "--smooth", "the smoother does not know its states yet"
-        )
     attitude_only = asked["wind_attitude.filter"] == "quaternion"
     if smooth and attitude_only:
         raise UsageError("no smoothing of the published filter", f"{estimator}, preset {preset}", "--smooth", "preset default has it")
@@ -123,6 +119,10 @@ def run(
     if smooth and not getattr(specification, "SMOOTHS", True):
         raise UsageError(
             f"no smoothing of {estimator}", "--smooth", "run", "a federated filter cannot be taken back in time; navigator can"
+        )
+    if smooth and model is not None:
+        raise UsageError(
+            "a smoothed run without a vehicle's model", str(vehicle)[:60], "--smooth", "the smoother does not know its states yet"
         )
     if model is None and getattr(specification, "REQUIRES_VEHICLE", False):
         raise UsageError(
