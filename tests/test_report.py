@@ -445,3 +445,10 @@ def test_report_reads_no_kernels() -> None:
     for path in Path(sys.modules["haltere.report"].__path__[0]).glob("*.py"):
         for name in re.findall(r"^\s*(?:from|import) (haltere\.[a-z]+)", path.read_text(encoding="utf-8"), re.MULTILINE):
             assert name in ("haltere.flight", "haltere.metrics", "haltere.report", *besides.get(path.name, ())), f"{path.name}: {name}"
+
+
+def test_an_error_that_could_not_be_computed_is_left_out(demo: tuple[Solution, FlightLog]) -> None:
+    solution, flight = demo
+    errors = {"truth": {**solution.summary["errors"]["truth"], "wind_n": {"rms": None, "max": None, "n": 10}}}
+    text = page(replace(solution, summary={**solution.summary, "errors": errors}), flight)
+    assert "errors against truth" in text

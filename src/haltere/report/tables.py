@@ -37,6 +37,8 @@ def _errors_table(errors: dict[str, Any], whose: str) -> str:
             continue
         cells = []
         for key, row in rows.items():
+            if row["rms"] is None or row["max"] is None:  # nothing of it could be compared
+                continue
             stem = key.rpartition("_")[0]
             unit, factor = ("deg", 1.0) if key.endswith("_deg") else _UNITS.get(stem, ("", 1.0))
             label = key.removesuffix("_deg").replace("_", " ")
