@@ -34,7 +34,7 @@ def test_flights_without_a_fault_are_answered(mission: str) -> None:
 def test_a_rotor_that_loses_thrust_is_named(mission: str, rotor: int) -> None:
     flight = flown(mission, 61, f"rotor.{rotor}:thrust=0.7@60.3")
     (event,) = [e for e in haltere.run(flight).events if e["sensor"] == "rotors"]
-    assert event["candidates"] == [f"rotors.{rotor}"]
+    assert event["candidates"] == [f"rotor.{rotor}"]
     assert event["axis"] == str(rotor)
     assert event["t_onset"] == pytest.approx(60.3, abs=0.5)
     assert event["t_detected"] - 60.3 < 1.0

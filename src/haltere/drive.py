@@ -171,7 +171,7 @@ def run(
             facts["warnings"].append(f"smoothed: {lost} times what came after could not be used; what is before was smoothed by itself")
     if scored and disturbances(solution.events):
         describe(solution, shown, _unwatched(resolved, initial, model, t, gyro, accel, offered, solution.t))
-    if scored and resolved["diagnosis.inertial"] == "on" and inertial_findings(solution.events):
+    if scored and estimator == "navigator" and resolved["diagnosis.inertial"] == "on" and inertial_findings(solution.events):
         solution.without = _without(resolved, initial, model, t, gyro, accel, offered)
         tell(solution)
     if scored and len(stations(flight)) > 1 and not attitude_only:

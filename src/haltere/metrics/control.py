@@ -162,9 +162,11 @@ def unanswered(flight: FlightLog, solution: Solution) -> Unanswered | None:
     sizes, each, sums = np.zeros(len(f.t)), np.zeros(len(f.t)), np.zeros((IN_A_ROW, 4))
     fitted, k, sd, spread = -math.inf, np.zeros((f.x.shape[1], 4)), np.ones(4), np.zeros((4, *(f.x.shape[1],) * 2))
     first: int | None = None
+    largest = 0.0
     for i in range(len(f.t)):
-        before = f.air & (f.t < f.t[i] - 1.0)
+        largest = max(largest, sizes[max(i - BEFORE, 0)])
         if f.t[i] - fitted >= HOLDS:
+            before = f.air & (f.t < f.t[i] - 1.0)
             if before.sum() < NEEDS / HOP:
                 continue
             fitted = float(f.t[i])
@@ -180,9 +182,9 @@ def unanswered(flight: FlightLog, solution: Solution) -> Unanswered | None:
             continue
         mean = sums.mean(axis=0)
         size = float(np.linalg.norm(mean))
-        threshold = max(LEFT, MORE * float(sizes[: max(i - BEFORE, 0) + 1].max()))
+        threshold = max(LEFT, MORE * float(largest))
         if size > threshold and bool((sums @ mean > LASTS * size * size).all()):  # a step of the gyro is over after two windows
-            return _found(f, i, each, mean * sd, sd, k, size, threshold, before)
+            return _found(f, i, each, mean * sd, sd, k, spread, size, threshold)
         sizes[i] = size
     return None
 
@@ -217,16 +219,16 @@ def _found(
     left: FloatArray,
     sd: FloatArray,
     k: FloatArray,
+    spread: FloatArray,
     size: float,
     threshold: float,
-    before: NDArray[np.bool_],
 ) -> Unanswered:  # fmt: skip
     """What is told of a stretch: since when, and whose missing thrust explains it."""
-    n = f.u.shape[1]
+    n, before = f.u.shape[1], f.air & (f.t < f.t[i] - 1.0)
     begins = i
     while begins > 0 and i - begins < 2 * IN_A_ROW and each[begins - 1] > 0.5 * size:
         begins -= 1
-    error = np.sqrt(np.array([np.diag(v)[:n] for v in _fit(f, before)[1]])).T * sd
+    error = np.sqrt(np.array([np.diag(v)[:n] for v in spread])).T * sd
     known = (np.abs(k[:n]) > 2.0 * error) & (np.abs(k[:n]) * np.mean(f.u[before], axis=0)[:, None] > sd)
     known[:, 2:] = False  # of yaw and thrust all rotors do much alike
     z, shares = left / sd, np.ones(n)  # of a rotor of which nothing is known: it cannot be excluded
@@ -258,7 +260,7 @@ def events(flight: FlightLog, solution: Solution) -> list[dict[str, Any]]:
     words += ["rotors or what drives them, or a blow from outside; no sensor of the navigation"]
     if not found.rotors:
         words.append("which rotor cannot be told from these commands")
-    names = [f"rotors.{k}" for k in found.rotors]
+    names = [f"rotor.{k}" for k in found.rotors]  # as the fault word of a thrust that is lost
     return [{
         "sensor": "rotors", "axis": str(found.rotors[0]) if len(names) == 1 else None, "kind": "thrust", "t_onset": found.onset,
         "t_detected": found.detected, "t_isolated": found.detected if len(names) == 1 else None, "t_recovered": None,
