@@ -19,6 +19,7 @@ NOMINAL = np.dtype(
     (
         np.record,
         [
+            ("alone", "i8"),  # no record of the product begins like this one
             ("w", "f8", 3),
             ("q", "f8", 4),
             ("v", "f8", 3),
