@@ -57,6 +57,15 @@ def test_the_crash_of_log_0041_is_no_sensor(shared_data: Path) -> None:
     assert "motor 1 at the highest command of the flight; imu.1 and imu.2 measure the same motion" in event["evidence"]
 
 
+def test_the_crash_of_log_0036_is_no_sensor(shared_data: Path) -> None:
+    """It noses down to 40 deg while both front motors are held at their limit, three seconds before it rolls over."""
+    flight = haltere.read(shared_data / "ardupilot" / "log_0036_mechanical_failure.bin")
+    (event,) = [e for e in haltere.run(flight).events if e["sensor"] == "rotors"]
+    assert event["candidates"] == ["rotor.0", "rotor.2"]
+    assert 143.8 < event["t_onset"] < event["t_detected"] < 147.3
+    assert "motors 0, 2 at the highest command of the flight; imu.1 measures the same motion" in event["evidence"]
+
+
 def test_a_flight_without_commands_tells_nothing(shared_data: Path) -> None:
     flight = haltere.read(shared_data / "px4" / "sample.ulg")
     assert unanswered(flight, haltere.run(flight, scored=False)) is None

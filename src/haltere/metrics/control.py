@@ -36,6 +36,9 @@ LEFT, MORE = 11.0, 1.5
 LASTS, LAST_LAG = 0.3, 20
 #: 1 sigma of coefficients before the flight, of rate change and of force: of commands, rates, velocity and its square [SI].
 WIDE, BY_RATE, BY_VELOCITY, BY_SQUARE = 1e3, (1.0, 0.1), (0.2, 0.5), (0.02, 0.02)
+#: Half of that is enough while some motors, not all, are held near the limit, one of them at it (parts of the highest command so far),
+#: and what is missing about roll and pitch points, by this cosine, to what those motors do.
+NEAR_LIMIT, AT_LIMIT, POINTS = 0.97, 0.998, 0.7
 #: Part of a window that the latency of the commands may be wrong by.
 LATE = 0.2
 #: What comes within so many windows is one and the same event, and no measure of what is usual.
@@ -183,8 +186,10 @@ def unanswered(flight: FlightLog, solution: Solution) -> Unanswered | None:
         mean = sums.mean(axis=0)
         size = float(np.linalg.norm(mean))
         threshold = max(LEFT, MORE * float(largest))
+        held = _held(f, i, k, sd, mean)
+        threshold *= 0.5 if held else 1.0
         if size > threshold and bool((sums @ mean > LASTS * size * size).all()):  # a step of the gyro is over after two windows
-            return _found(f, i, each, mean * sd, sd, k, spread, size, threshold)
+            return _found(f, i, each, mean * sd, sd, k, spread, size, threshold, held)
         sizes[i] = size
     return None
 
@@ -202,6 +207,17 @@ def _fit(f: _Windows, before: NDArray[np.bool_]) -> tuple[FloatArray, FloatArray
         spread[axis] = np.linalg.inv(x.T @ x / count + sd[axis] ** 2 * np.diag(prior**-2.0))
         k[:, axis] = spread[axis] @ (x.T @ y[:, axis]) / count
     return k, spread, sd
+
+
+def _held(f: _Windows, i: int, k: FloatArray, sd: FloatArray, z: FloatArray) -> tuple[int, ...]:
+    """Motors that have been held at their limit where the moment that is missing is theirs."""
+    part = np.sqrt(f.u[i - IN_A_ROW + 1 : i + 1].min(axis=0) / float(np.max(f.u[: i + 1][f.air[: i + 1]])))
+    held = part >= NEAR_LIMIT
+    if part.max() < AT_LIMIT or held.all():
+        return ()
+    loss = -(f.u[i, held] @ k[: f.u.shape[1]][held, :2]) / sd[:2]
+    points = bool(loss @ z[:2] > POINTS * np.linalg.norm(loss) * np.linalg.norm(z[:2]))
+    return tuple(int(r) for r in np.flatnonzero(held)) if points else ()
 
 
 def _alike(z: FloatArray) -> float:
@@ -222,7 +238,8 @@ def _found(
     spread: FloatArray,
     size: float,
     threshold: float,
-) -> Unanswered:  # fmt: skip
+    held: tuple[int, ...],
+) -> Unanswered:
     """What is told of a stretch: since when, and whose missing thrust explains it."""
     n, before = f.u.shape[1], f.air & (f.t < f.t[i] - 1.0)
     begins = i
@@ -240,6 +257,7 @@ def _found(
             shares[r] = 1.0 - float(np.sum((shown - part * loss) ** 2) / (shown @ shown))
     order = [int(r) for r in np.argsort(shares)[::-1]]
     rotors = tuple(r for r in order if shares[r] > max(EXPLAINS, shares[order[0]] - APART))
+    rotors = held or rotors
     rotors = rotors if len(rotors) <= 2 else ()
     highest = np.sqrt(np.max(f.u[before], axis=0))
     return Unanswered(float(f.t[begins]), float(f.t[i] + WIDTH), left, size, threshold, np.sqrt(f.u[i]), np.asarray(highest), rotors)
@@ -253,7 +271,7 @@ def events(flight: FlightLog, solution: Solution) -> list[dict[str, Any]]:
     left = ", ".join(
         f"{name} {value:+.2g} {'m/s²' if name == 'thrust' else 'rad/s²'}" for name, value in zip(NAMES, _upward(found.left), strict=True)
     )
-    at_limit = [str(k) for k in range(len(found.commands)) if found.commands[k] > 0.97 * max(found.highest[k], 0.0)]
+    at_limit = [str(k) for k in range(len(found.commands)) if found.commands[k] > NEAR_LIMIT * found.highest.max()]
     words = [f"the vehicle does not do what its motors are told: {left} unasked for, {found.statistic:.0f} times the usual"]
     words += [f"motor{'s' if len(at_limit) > 1 else ''} {', '.join(at_limit)} at the highest command of the flight"] if at_limit else []
     words += _same_motion(flight, found)
