@@ -44,7 +44,7 @@ def vehicle(preset: str = "full", seed: int = 0) -> Any:
             [1.5e-3, -0.92, -1.7, 1e-6, 1e-4], [1.5e-3, 0.92, -1.7, 1e-6, -1e-4], [1.9e-5, 0.05, -0.3, 1e-5, 1e-7],
         ]
     )  # fmt: skip
-    use = np.zeros((6, 5))
+    use = np.zeros((6, 7))
     for i, columns in enumerate(PRESETS[preset]):
         use[i, list(columns)] = 1.0
     M["k"], M["aero"], M["literal"] = k * use * rng.uniform(0.8, 1.2, k.shape), np.array(AERO, float), int(preset == "literal")

@@ -24,7 +24,7 @@ N = 4
 
 def lumped(**changes: Any) -> Lumped:
     """A model of four rotors without forces."""
-    return Lumped("full", np.ones(N), np.ones(N), np.ones(N), np.zeros((6, 5)), np.zeros((6, 5, 5)), **changes)
+    return Lumped("full", np.ones(N), np.ones(N), np.ones(N), np.zeros((6, 7)), np.zeros((6, 7, 7)), **changes)
 
 
 def test_speeds_at_a_time_are_interpolated_between_samples_and_held_for_a_while() -> None:

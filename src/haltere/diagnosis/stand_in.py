@@ -72,13 +72,15 @@ def offset_variance(s: Any, axis: int) -> float:
 
 @jit
 def density_of_noise(s: Any, axis: int) -> float:
-    """Spectral density of what the model of an axis leaves: what changes between its windows, and what lasts about a second.
+    """Spectral density of what the model of an axis leaves: the larger of what its windows and their means over a second say.
 
-    White noise of density q has the variance q/T in means over T. What lasts much longer is left to the offset.
+    White noise of density q has the variance q/T in means over T. A negative correlation of neighbouring windows is that of a difference of
+    samples: the noise of the sensor, no error of the model. What lasts much longer than a second is left to the offset.
     """
     m = s.model[0]
     sd, slow = max(m.sd[axis], LEAST_NOISE), m.slow[axis]
-    return float(sd * sd * m.window[0 if axis < FORCES else 1] + slow * slow * SECOND)
+    short = sd * sd * m.window[0 if axis < FORCES else 1] * max(1.0 + 2.0 * min(m.ar1[axis], 0.0), 0.0)
+    return float(max(short, slow * slow * SECOND, LEAST_NOISE * LEAST_NOISE * m.window[1]))
 
 
 @jit

@@ -18,6 +18,9 @@ __all__ = ["Lumped", "lumped_of"]
 
 FloatArray = NDArray[np.float64]
 
+#: A file that lacks the columns after these has none of their constants.
+LEAST_COLUMNS = 5
+
 
 @dataclass(frozen=True)
 class Lumped:
@@ -30,14 +33,16 @@ class Lumped:
     roll, pitch, yaw
         Weights of the rotors (n,): -y, x [m] and spin of a known geometry, else relative to their mean size.
     k
-        Constants (6, 5) by axis hx, hy, t, r, p, q and column; 0 where the preset has none.
+        Constants (6, 7) by axis hx, hy, t, r, p, q and column; 0 where the preset has none.
     covariance
-        Of the constants of each axis (6, 5, 5).
+        Of the constants of each axis (6, 7, 7).
     density
         Air density of the constants [kg/m^3].
     residual_sd, residual_ar1, residual_slow
         By axis (6,): what is left in windows of ``window`` [s] (forces, moments), 1 sigma [m/s^2, rad/s^2]; its correlation with the next
         window; the part that lasts over one second, 1 sigma.
+    s1
+        Sum of the rotor speeds at which the damping of rates is kR2, kP2, kQ2 [rad/s]; 0 where it does not go with that sum.
     lag
         Rotor speeds were valid so long before their stamps [s].
     valid
@@ -60,10 +65,11 @@ class Lumped:
     lag: float = 0.0
     valid: Mapping[str, Any] = field(default_factory=dict)
     motor: Mapping[str, Any] | None = None
+    s1: float = 0.0
 
     @property
     def sd(self) -> FloatArray:
-        """1 sigma of the constants (6, 5)."""
+        """1 sigma of the constants (6, 7)."""
         return np.asarray(np.sqrt(np.maximum(np.einsum("aii->ai", self.covariance), 0.0)))
 
     def record(self) -> NDArray[np.void]:
@@ -71,7 +77,7 @@ class Lumped:
         m = as_records(np.zeros(1, lumped_layout(len(self.yaw))))
         m["roll"], m["pitch"], m["yaw"], m["k"], m["aero"] = self.roll, self.pitch, self.yaw, self.k, np.array(AERO, dtype=np.float64)
         m["literal"] = int(self.preset == "literal")
-        m["density"], m["lag"] = self.density, self.lag
+        m["density"], m["lag"], m["s1"] = self.density, self.lag, self.s1
         m["sd"], m["slow"], m["ar1"], m["window"] = self.residual_sd, self.residual_slow, self.residual_ar1, self.window
         return m
 
@@ -79,7 +85,7 @@ class Lumped:
         """The table ``[lumped]`` of a vehicle file."""
         used = PRESETS[self.preset]
         return {
-            "preset": self.preset, "density": self.density, "lag": self.lag, "window": list(self.window),
+            "preset": self.preset, "density": self.density, "s1": self.s1, "lag": self.lag, "window": list(self.window),
             "roll": self.roll.tolist(), "pitch": self.pitch.tolist(), "yaw": self.yaw.tolist(),
             "k": {a: {NAMES[i][j]: float(self.k[i, j]) for j in used[i]} for i, a in enumerate(AXES)},
             "covariance": {a: self.covariance[i][np.ix_(used[i], used[i])].tolist() for i, a in enumerate(AXES)},
@@ -111,15 +117,18 @@ def lumped_of(vehicle: Vehicle, where: str = "vehicle file") -> Lumped:
     for i, axis in enumerate(AXES):
         constants = table.get("k", {}).get(axis)
         names = [NAMES[i][j] for j in used[i]]
-        if not isinstance(constants, Mapping) or set(constants) != set(names):
+        must = names[:LEAST_COLUMNS]
+        if not isinstance(constants, Mapping) or not set(must) <= set(constants) <= set(names):
             raise HaltereError(f"constants {', '.join(names)}", "others or none", f"{where} k.{axis}")
-        k[i, list(used[i])] = [float(constants[n]) for n in names]
+        names = [n for n in names if n in constants]
+        there = [j for j in used[i] if NAMES[i][j] in constants]
+        k[i, there] = [float(constants[n]) for n in names]
         block = np.asarray(table.get("covariance", {}).get(axis, np.zeros((len(names), len(names)))), dtype=np.float64)
         if block.shape != (len(names), len(names)) or not np.isfinite(block).all():
             raise HaltereError(
                 f"a covariance of {len(names)} by {len(names)} numbers", f"shape {block.shape}", f"{where} covariance.{axis}"
             )
-        covariance[i][np.ix_(used[i], used[i])] = block
+        covariance[i][np.ix_(there, there)] = block
     if not np.isfinite(k).all():
         raise HaltereError("finite constants", "others", where)
     sd, ar1, slow = (_vector(table, n, 6, where) for n in ("residual_sd", "residual_ar1", "residual_slow"))
@@ -130,7 +139,7 @@ def lumped_of(vehicle: Vehicle, where: str = "vehicle file") -> Lumped:
     return Lumped(
         preset, weights[0], weights[1], weights[2], k, covariance, float(table.get("density", 1.225)), sd, ar1, slow,
         (float(window[0]), float(window[1])), float(table.get("lag", 0.0)), dict(table.get("valid", {})),
-        motor,
+        motor, float(table.get("s1", 0.0)),
     )  # fmt: skip
 
 

@@ -48,7 +48,7 @@ class Check:
 def _predicted(tr: Track, model: Lumped, arm: FloatArray) -> list[tuple[FloatArray, FloatArray, FloatArray]]:
     """Times, measured and predicted by axis, in windows of force [m/s^2] and of rate change over their length [rad/s^2]."""
     weights = (model.roll, model.pitch, model.yaw)
-    x = columns(tr, tr.speeds.mean, weights, model.preset == "literal")
+    x = columns(tr, tr.speeds.mean, weights, model.preset == "literal", model.s1)
     out = []
     for axis in range(6):
         used = PRESETS[model.preset][axis]

@@ -62,7 +62,8 @@ def instrumented(
     stretch
         Which stretch each row belongs to (n,); stretches are taken as independent, whatever the colour within.
     mean, precision
-        What is thought of the constants before, and one over its variance (p,); nothing by default.
+        What is thought of the constants before (p,), and one over its variance in the unit of the sum of squares: times the variance of
+        what is left and the number of rows in a stretch. Nothing by default.
     """
     p = a.shape[1]
     x, d = 0.5 * (a + b), a - b
@@ -87,7 +88,8 @@ def instrumented(
     inverse = np.linalg.inv(A + 1e-12 * np.eye(p))
     spread = inverse @ (groups.T @ groups) @ inverse * (n / max(n - p, 1))
     # where the data tell nothing the prior stands, with its own width
-    covariance = spread + inverse @ np.diag(prior) @ inverse
+    unit = float(np.var(e)) * len(y) / n
+    covariance = spread + unit * inverse @ np.diag(prior) @ inverse
     eigen = np.linalg.eigvalsh(G / len(y))
     return Instrumented(
         k / size, covariance / np.outer(size, size), plain / size, float(np.sqrt(eigen[-1] / max(eigen[0], 1e-15))),

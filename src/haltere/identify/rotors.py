@@ -163,7 +163,9 @@ class Layout:
 
 
 def find_layout(
-    blocks: list[tuple[FloatArray, FloatArray, FloatArray, NDArray[np.int64]]], geometry: tuple[FloatArray, FloatArray, FloatArray] | None
+    blocks: list[tuple[FloatArray, FloatArray, FloatArray, NDArray[np.int64]]],
+    geometry: tuple[FloatArray, FloatArray, FloatArray] | None,
+    rotors: int,
 ) -> Layout:
     """Signs of every rotor about every axis, against a geometry's weights where there is one.
 
@@ -174,6 +176,8 @@ def find_layout(
         and stretches.
     geometry
         Weights -y, x and spin of the rotors.
+    rotors
+        Their number: so many columns come first.
 
     Raises
     ------
@@ -181,9 +185,8 @@ def find_layout(
         The geometry contradicts the flights, and in which order it would not.
     """
     fits: list[Instrumented] = [instrumented(*block) for block in blocks]
-    r = blocks[2][1].shape[1] // 2 - 1  # of q: every rotor's square and its change, two more
-    effect = np.array([f.k[:r] for f in fits])
-    sd = np.array([f.sd[:r] for f in fits])
+    effect = np.array([f.k[:rotors] for f in fits])
+    sd = np.array([f.sd[:rotors] for f in fits])
     # what a rotor does beside the mean of all is what tells it from the others: a tilted or shifted body gives all the same sign
     beside = effect - effect.mean(axis=1, keepdims=True)
     clear = np.array([_explained(f, block) > 0.5 for f, block in zip(fits, blocks, strict=True)])

@@ -100,11 +100,12 @@ def _dt(t: FloatArray) -> float:
     return float(np.median(np.diff(t)))
 
 
-def columns(tr: Track, speeds: FloatArray, weights: tuple[FloatArray, FloatArray, FloatArray], literal: bool) -> FloatArray:
-    """Columns of all axes (n, 6, 5) with one reading of the rotor speeds, those of the air times the density's ratio."""
+def columns(tr: Track, speeds: FloatArray, weights: tuple[FloatArray, FloatArray, FloatArray], literal: bool, s1: float) -> FloatArray:
+    """Columns of all axes (n, 6, 7) with one reading of the rotor speeds, those of the air times the density's ratio."""
     m = tr.motion
     record = as_records(np.zeros(1, lumped_layout(len(weights[0]))))
     record["roll"], record["pitch"], record["yaw"] = weights
+    record["s1"] = s1
     dt = _dt(m.t)
     smooth = box(speeds, max(round(0.02 / dt) | 1, 3))
     accelerations = np.gradient(smooth, m.t, axis=0)

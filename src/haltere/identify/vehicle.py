@@ -33,6 +33,8 @@ FloatArray = NDArray[np.float64]
 LEAST, STILL_SD, OFFSET_SD = 3.0, 0.02, 0.1
 #: Spread of the force along z below which thrust is said not to change [m/s^2].
 LEAST_THRUST_SPREAD = 0.5
+#: Ratio (Izz - Iyy)/Ixx of a flat vehicle before the flights, and its 1 sigma.
+FLAT, FLAT_SD = 0.9, 0.2
 #: Sigma of a constant below which it is said not to be told.
 TOLD = 2.0
 
@@ -50,11 +52,11 @@ class VehicleIdentification:
     layout
         What each rotor does.
     plain
-        Constants by ordinary least squares (6, 5), of moments and thrust, for comparison.
+        Constants by ordinary least squares (6, 7), of moments and thrust, for comparison.
     condition
         Condition number of each axis' columns (6,).
     told
-        Constants more than two sigma away from zero (6, 5).
+        Constants more than two sigma away from zero (6, 7).
     across
         The fit of the forces across the thrust axis, with the winds.
     arm, arm_sd
@@ -186,8 +188,9 @@ def _identified(motions: list[Motion], preset: str, given: Vehicle | None, still
     condition = np.zeros(6)
     arm, arm_sd = _across(across, preset, k, cov, plain)
     weights = (layout.roll, layout.pitch, layout.yaw)
-    first = [columns(tr, tr.speeds.first, weights, preset == "literal") for tr in tracks]
-    second = [columns(tr, tr.speeds.second, weights, preset == "literal") for tr in tracks]
+    s1 = float(np.mean(np.concatenate([tr.speeds.mean[tr.use].sum(axis=1) for tr in tracks]))) if preset == "full" else 0.0
+    first = [columns(tr, tr.speeds.first, weights, preset == "literal", s1) for tr in tracks]
+    second = [columns(tr, tr.speeds.second, weights, preset == "literal", s1) for tr in tracks]
     for axis in range(2, 6):
         found = _fit_axis(axis, used[axis], tracks, first, second, arm, instruments, notes)
         j = np.array(used[axis])
@@ -200,7 +203,7 @@ def _identified(motions: list[Motion], preset: str, given: Vehicle | None, still
             force_windows(tr, a, b, axis, used[axis], arm) for tr, a, b in zip(tracks, first, second, strict=True))]))  # fmt: skip
     lumped = Lumped(
         preset, *weights, k, cov, 1.225, np.zeros(6), np.zeros(6), np.zeros(6), (FORCE, MOMENT),
-        float(np.median([s.lag for s in speeds])), _valid(tracks),
+        float(np.median([s.lag for s in speeds])), _valid(tracks), None, s1,
     )  # fmt: skip
     lumped = with_residuals(lumped, tracks, arm)
     told = np.abs(k) > TOLD * lumped.sd
@@ -245,8 +248,8 @@ def _calm(windows: list[Samples], still: bool | None, notes: list[str]) -> bool:
     return calm
 
 
-def _layout(tracks: list[Track], given: Vehicle | None) -> Layout:
-    """What each rotor does, from windows of rate change."""
+def _layout(tracks: list[Track], given: Vehicle | None, signs: tuple[FloatArray, FloatArray] | None = None) -> Layout:
+    """What each rotor does, from windows of rate change; anew with the ``signs`` in roll and pitch that were found first."""
     n = tracks[0].speeds.first.shape[1]
     if any(tr.speeds.first.shape[1] != n for tr in tracks):
         raise HaltereError("flights of one vehicle", f"{[tr.speeds.first.shape[1] for tr in tracks]} rotors", "identify")
@@ -264,15 +267,19 @@ def _layout(tracks: list[Track], given: Vehicle | None) -> Layout:
             cross = w[:, (axis + 1) % 3] * w[:, (axis + 2) % 3]
             readings = []
             for reading in (tr.speeds.first, tr.speeds.second):
+                total = reading.sum(axis=1)
+                sides = [] if signs is None else [reading @ s for s in signs]
                 if axis == 2:
-                    extra = [np.gradient(reading, tr.t, axis=0)]
+                    extra = [np.gradient(reading, tr.t, axis=0), *(side * tr.v_air[:, k] for k, side in enumerate(sides))]
                 else:
-                    extra = [reading.sum(axis=1) * tr.v_air[:, 1 - axis]]
-                readings.append(np.column_stack([reading**2 * tr.ratio[:, None], cross, w[:, axis], *extra]))
+                    extra = [total * tr.v_air[:, 1 - axis], w[:, 2] * tr.v_air[:, axis]]
+                    extra += [sides[axis] * tr.v_air[:, 2]] if sides else []
+                readings.append(np.column_stack([reading**2 * tr.ratio[:, None], cross, total * w[:, axis], *extra]))
             parts.append(moment_windows(tr, readings[0], readings[1], axis))
         both = _joined(parts)
         blocks.append((both.y, both.a, both.b, both.stretch))
-    return find_layout(blocks, geometry)
+    found = find_layout(blocks, geometry, n)
+    return found if signs is not None else _layout(tracks, given, (np.sign(found.roll), np.sign(found.pitch)))
 
 
 def _joined(parts: list[Windows]) -> Windows:
@@ -301,7 +308,7 @@ def _fit_axis(
     both = _joined(parts)
     if len(both.y) < 5 * len(used):
         raise HaltereError(f"at least {5 * len(used)} windows in the air", f"{len(both.y)}", "identify", "give longer flights")
-    sd = _thought(axis, tracks)[list(used)]
+    mean, sd = (v[list(used)] for v in _thought(axis, tracks))
     left = both.y - both.x @ np.linalg.lstsq(both.x, both.y, rcond=None)[0]
     # in the unit of the sum of squares; what is left lasts, so that a stretch counts as one sample
     precision = float(np.var(left)) * len(both.y) / len(np.unique(both.stretch)) / sd**2
@@ -309,23 +316,25 @@ def _fit_axis(
         precision[[n for n, j in enumerate(used) if j == 3]] = 1e12  # of a thrust that never changes no offset is told
         notes.append("thrust hardly changed: kT0 is thrust over speed squared, the offset kT3 is taken for none")
     a, b = (both.a, both.b) if iv else (both.x, both.x)
-    return instrumented(both.y, a, b, both.stretch, np.zeros(len(used)), precision)
+    return instrumented(both.y, a, b, both.stretch, mean, precision)
 
 
-def _thought(axis: int, tracks: list[Track]) -> FloatArray:
-    """1 sigma of the constants of an axis before the flights (5,): wide, but no hover may find a thrust that does not carry.
+def _thought(axis: int, tracks: list[Track]) -> tuple[FloatArray, FloatArray]:
+    """Constants of an axis before the flights, 1 sigma (7,): wide, but no hover may find a thrust that does not carry.
 
-    An offset of the force is the accelerometer's; products of rates are ratios of inertias, below one; the rest is given as damping
-    [1/s] or acceleration at the speeds flown.
+    An offset of the force is the accelerometer's. Products of rates are ratios of inertias, and a multirotor is flat: Izz is little less
+    than Ixx + Iyy, so that (Iyy - Izz)/Ixx is little above -1 (-0.81 to -1.02 of the vehicles of theory.md §7). The rest is given as
+    damping [1/s] or acceleration at the speeds flown.
     """
     speeds = np.concatenate([tr.speeds.mean[tr.use] for tr in tracks])
     s1, s2 = float(np.mean(speeds.sum(axis=1))), float(np.mean((speeds**2).sum(axis=1)))
-    free = 1e6
+    free, mean = 1e6, np.zeros(COLUMNS)
     if axis == 2:
-        return np.array([free, 0.05, 1.0 / s1, OFFSET_SD, free])
+        return mean, np.array([free, 0.05, 1.0 / s1, OFFSET_SD, free, free, free])
+    mean[1] = (-FLAT, FLAT, 0.0)[axis - 3]
     if axis < 5:
-        return np.array([free, 1.0, 3.0, 10.0 / s2, 2.0 / s1])
-    return np.array([free, 1.0, 3.0, free, 10.0 / s2])
+        return mean, np.array([free, FLAT_SD, 3.0, 10.0 / s2, 2.0 / s1, 0.3, 50.0 / s1])
+    return mean, np.array([free, FLAT_SD, 3.0, free, 10.0 / s2, 20.0 / s1, 20.0 / s1])
 
 
 def _across(r: Result, preset: str, k: FloatArray, cov: FloatArray, plain: FloatArray) -> tuple[FloatArray, FloatArray]:

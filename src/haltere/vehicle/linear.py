@@ -32,9 +32,11 @@ def linear(m: Any, speeds: Any, accelerations: Any, v: Vec, w: Vec, eta: Vec, ra
         Air density over that of the constants.
     """
     f, a = model(m, speeds, accelerations, v, w, eta, ratio)
-    s1 = 0.0
+    s1, v_r, v_p = 0.0, 0.0, 0.0
     for i in range(len(m.yaw)):
         s1 += speeds[i]
+        v_r += m.roll[i] * speeds[i]
+        v_p += m.pitch[i] * speeds[i]
     k, g = m.k, ratio
     size = norm(v)
     x0, x3 = g * k[0, 0] * s1 + g * k[0, 2], g * k[0, 3]
@@ -47,10 +49,15 @@ def linear(m: Any, speeds: Any, accelerations: Any, v: Vec, w: Vec, eta: Vec, ra
     )
     own = 0.0 if m.literal == 1 else g
     D_w = ((0.0, own * k[0, 1], 0.0), (own * k[1, 1], 0.0, 0.0), (0.0, 0.0, 0.0))
-    M_a = ((0.0, g * k[3, 4] * s1, 0.0), (g * k[4, 4] * s1, 0.0, 0.0), (0.0, 0.0, 0.0))
+    M_a = (
+        (g * k[3, 5] * w[2], g * k[3, 4] * s1, g * k[3, 6] * v_r),
+        (g * k[4, 4] * s1, g * k[4, 5] * w[2], g * k[4, 6] * v_p),
+        (g * k[5, 5] * v_r, g * k[5, 6] * v_p, 0.0),
+    )
+    s = g * s1 / m.s1 if m.s1 > 0.0 else g
     M_w = (
-        (g * k[3, 2], k[3, 1] * w[2], k[3, 1] * w[1]),
-        (k[4, 1] * w[2], g * k[4, 2], k[4, 1] * w[0]),
-        (k[5, 1] * w[1], k[5, 1] * w[0], g * k[5, 2]),
+        (s * k[3, 2], k[3, 1] * w[2], k[3, 1] * w[1] + g * k[3, 5] * v[0]),
+        (k[4, 1] * w[2], s * k[4, 2], k[4, 1] * w[0] + g * k[4, 5] * v[1]),
+        (k[5, 1] * w[1], k[5, 1] * w[0], s * k[5, 2]),
     )
     return f, a, D_a, D_w, M_a, M_w
