@@ -23,7 +23,8 @@ FloatArray = NDArray[np.float64]
 TITLES = ("force x [m/s²]", "force y [m/s²]", "force z [m/s²]", "roll [rad/s²]", "pitch [rad/s²]", "yaw [rad/s²]")
 TEXT = (
     ("ΣΩ v_x", "rate q", "v_x", "|v| v_x", "1"), ("ΣΩ v_y", "rate p", "v_y", "|v| v_y", "1"), ("ΣΩ²", "v_x² + v_y²", "ΣΩ v_z", "1", ""),
-    ("U_R", "q r", "p", "ΣΩ²", "ΣΩ v_y"), ("U_P", "p r", "q", "ΣΩ²", "ΣΩ v_x"), ("U_Q", "p q", "r", "Σ yaw dΩ/dt", "ΣΩ²"),
+    ("U_R", "q r", "s p", "ΣΩ²", "ΣΩ v_y", "r v_x", "V_R v_z"), ("U_P", "p r", "s q", "ΣΩ²", "ΣΩ v_x", "r v_y", "V_P v_z"),
+    ("U_Q", "p q", "s r", "Σ yaw dΩ/dt", "ΣΩ²", "V_R v_x", "V_P v_y"),
 )  # fmt: skip
 #: Errors on flights not seen over those on its own, up to which a model is taken as tested.
 FAIR = 1.5
