@@ -6,6 +6,7 @@ import json
 import tomllib
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -258,6 +259,23 @@ def test_other_presets(excited: FlightLog, identified: VehicleIdentification, pr
     assert all(d.lumped.k[i, j] == 0.0 for i in range(6) for j in range(5) if j not in used[i])
     assert d.lumped.residual_sd[2] > identified.lumped.residual_sd[2]  # thrust without inflow (theory.md §5.2)
     assert lumped_of(d.as_vehicle()).preset == preset
+
+
+def test_a_file_without_the_hubs_own_velocities_is_read(identified: VehicleIdentification) -> None:
+    """Files of before: five constants of each moment, damping that does not go with the rotor speed."""
+    vehicle = parse_vehicle(to_toml(identified))
+    table: dict[str, Any] = json.loads(json.dumps(vehicle.lumped))
+    del table["s1"]
+    for axis in "rpq":
+        table["k"][axis] = {name: v for name, v in table["k"][axis].items() if name[-1] not in "56"}
+        table["covariance"][axis] = np.array(table["covariance"][axis])[:5, :5].tolist()
+    found = lumped_of(replace(vehicle, lumped=table))
+    assert found.k[:, :5] == pytest.approx(identified.lumped.k[:, :5])
+    assert (found.k[:, 5:] == 0.0).all()
+    assert found.s1 == 0.0
+    del table["k"]["q"]["kQ3"]
+    with pytest.raises(HaltereError, match="constants kQ0"):
+        lumped_of(replace(vehicle, lumped=table))
 
 
 def test_the_vehicle_file_gives_the_model_back(identified: VehicleIdentification) -> None:
