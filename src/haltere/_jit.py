@@ -13,14 +13,14 @@ import os
 from collections.abc import Callable
 from functools import lru_cache
 from pathlib import Path
-from typing import TypeVar, cast
+from typing import Any, TypeVar, cast
 
 import numpy as np
 from numpy.typing import NDArray
 
 F = TypeVar("F", bound=Callable[..., object])
 
-__all__ = ["COMPILED", "as_records", "cache_folder", "constant", "entry", "jit"]
+__all__ = ["COMPILED", "as_records", "cache_folder", "constant", "entry", "jit", "where"]
 
 #: False under ``HALTERE_JIT=0``.
 COMPILED = os.environ.get("HALTERE_JIT", "1") != "0"
@@ -59,6 +59,7 @@ def cache_folder(simulator: bool = False) -> Path:
 
 if COMPILED:
     import numba
+    import numba.extending
 
     def _compile(function: F, **options: bool) -> F:
         # no reference counts (_nrt): a kernel only borrows arrays, so that none need be counted at every call, and none can be made
@@ -78,6 +79,28 @@ if COMPILED:
         """Compile a kernel that only kernels call: without the wrappers for Python, a quarter of the compile time."""
         return _compile(function) if _OPEN else _compile(function, no_cpython_wrapper=True, no_cfunc_wrapper=True)
 
+    def where(block: str, function: F, otherwise: F) -> F:
+        """Kernel that is ``function(s, ...)`` for records whose field ``block`` has elements, else ``otherwise(s, ...)``.
+
+        Which one is settled by the type of the record, so that what a layout does not have is not compiled for it: an ``if`` on the length
+        is folded away only after both sides were.
+        """
+
+        def choice(s: Any, *args: Any) -> object:
+            chosen: Callable[..., object] = function if len(getattr(s, block)) > 0 else otherwise
+            return chosen(s, *args)
+
+        def choose(s: Any, *args: Any) -> Callable[..., object]:
+            chosen: Callable[..., object] = function if s.typeof(block).shape[0] > 0 else otherwise
+
+            def settled(s: Any, *args: Any) -> object:
+                return chosen(s, *args)
+
+            return settled
+
+        numba.extending.overload(choice, strict=False, jit_options={"error_model": "numpy", "_nrt": False})(choose)  # type: ignore[typeddict-unknown-key]
+        return cast(F, choice)
+
 else:
 
     def entry(function: F) -> F:
@@ -87,3 +110,11 @@ else:
     def jit(function: F) -> F:
         """Leave a kernel as plain Python."""
         return function
+
+    def where(block: str, function: F, otherwise: F) -> F:
+        """Kernel that is ``function(s, ...)`` for records whose field ``block`` has elements, else ``otherwise(s, ...)``."""
+
+        def choice(s: Any, *args: Any) -> object:
+            return (function if len(getattr(s, block)) > 0 else otherwise)(s, *args)
+
+        return cast(F, choice)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from haltere._jit import jit
+from haltere._jit import jit, where
 from haltere.aids import (
     airspeed,
     attitude,
@@ -101,6 +101,15 @@ def air_offer_of(s: Any, prm: Any, sensor: int, m: Any) -> AirOffer:
 
 
 @jit
+def no_air_offer(s: Any, prm: Any, sensor: int, m: Any) -> AirOffer:
+    """Without a wind nothing of the air is heard."""
+    return SILENT
+
+
+air_offer = where("wind", air_offer_of, no_air_offer)
+
+
+@jit
 def of_the_air(sensor: int) -> bool:
     """Whether `air_offer_of` speaks for a sensor."""
     return sensor in (AIRSPEED, VANES, WIND, DRAG, NO_SIDESLIP)
@@ -156,7 +165,7 @@ def fuse_all(s: Any, prm: Any, aids: Any, dt: float, w: Vec, f: Vec, first: int,
             m = s.ring[sensor if sensor < N_QUEUED else 0, i]
             resting = s.rest.still == 1 and s.rest.moved == 0
             if of_the_air(sensor):
-                fuse_offer(s, aids, t, sensor, air_offer_of(s, prm, sensor, m))
+                fuse_offer(s, aids, t, sensor, air_offer(s, prm, sensor, m))
                 if sensor >= N_QUEUED:
                     sensor += 1
                 continue

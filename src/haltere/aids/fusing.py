@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from typing import Any
 
-from haltere._jit import constant, jit
+from haltere._jit import constant, jit, where
 from haltere.aids.record import (
     C_HEADING,
     DEWEIGHTED,
@@ -121,6 +121,15 @@ def judge(s: Any, sensor: int, t: float, ratio: float, timeout: float, reason: i
 
 
 @jit
+def _untold(s: Any, H: Any, S: float, y: float, component: int, evidence: bool, moved: bool) -> None:
+    return
+
+
+#: The bank of the diagnosis, where there is one, hears of an innovation.
+told = where("bank", matched, _untold)
+
+
+@jit
 def fuse_offer(s: Any, aids: Any, t: float, sensor: int, offer: Any) -> None:
     """Test the components of an offer together (NIS/gate²), fuse them one after the other, and record them.
 
@@ -175,14 +184,14 @@ def fuse_offer(s: Any, aids: Any, t: float, sensor: int, offer: Any) -> None:
                     project_gain(s, turn == ONLY_TURN)
                 e_i = innovation(s, row, e_i)
                 if len(s.bank) > 0:
-                    matched(s, row, variance_i, e_i, component + i, sensor <= MAGNETOMETER and component <= C_HEADING, True)
+                    told(s, row, variance_i, e_i, component + i, sensor <= MAGNETOMETER and component <= C_HEADING, True)
                 apply(s, row, r_i, e_i)
         inject(s)
     elif len(s.bank) > 0 and reason == R_INNOVATION and s.aid[sensor].started != DISTRUSTED and sensor <= MAGNETOMETER:
         for i in range(n):  # what the filter refuses is evidence all the same
             row = H0 if i == 0 else (H1 if i == 1 else H2)
             if z[i] == z[i]:
-                matched(s, row, s_ii[i], e[i], component + i, component <= C_HEADING, False)
+                told(s, row, s_ii[i], e[i], component + i, component <= C_HEADING, False)
     for i in range(n):
         if z[i] == z[i]:
             record(s, aids, t, sensor, component + i, z[i], e[i], math.sqrt(s_ii[i]), ratio, weight, status, reason)

@@ -45,8 +45,8 @@ from haltere.core.rotation import (
     triad,
     wrap,
 )
-from haltere.diagnosis import pairs, stand_in
 from haltere.estimators import yaw_bank
+from haltere.estimators.beside import begin_anew
 from haltere.filter.queue import pop_due
 
 __all__ = ["AT_REST", "GIVEN", "GRAVITY_ONLY", "IN_MOTION", "begin", "gather", "level_and_compass", "start_air"]
@@ -286,9 +286,7 @@ def start(s: Any, prm: Any, kind: int, f_b: Vec, a_n: Vec) -> None:
         s.mag[i] = 0.0
         P[o + i, o + i] = prm.init_mag_offset * prm.init_mag_offset
     start_air(s, prm, o + len(s.mag))
-    if len(s.pairs) > 0:
-        stand_in.forget(s)
-        pairs.restart(s)
+    begin_anew(s)
     for k2 in range(len(s.aid)):
         s.aid[k2].t_passed = s.t
         s.aid[k2].t_due = s.t

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from typing import Any
 
-from haltere._jit import entry, jit
+from haltere._jit import entry, jit, where
 from haltere.aids import drag, fake, first_stage, rest
 from haltere.aids.air import wind_covariance, wind_n
 from haltere.aids.dispatch import N_SENSORS, fuse_all
@@ -27,10 +27,10 @@ from haltere.aids.record import (
     event,
 )
 from haltere.core.rotation import Vec, cross, dcm, mat_vec, quat_from_rotvec, quat_mul
-from haltere.diagnosis import inertial, model_faults, pairs, stand_in, steps
 from haltere.estimators import alignment, yaw_bank
+from haltere.estimators.beside import across, carry, compare, couple, diagnose, hold, turning
 from haltere.filter.queue import pop_imu, push, push_imu
-from haltere.filter.rotors import push_rotors, rotors_at
+from haltere.filter.rotors import push_rotors
 from haltere.strapdown.optional import get_optional
 from haltere.strapdown.propagate import predict, unseen
 
@@ -227,8 +227,7 @@ def predict_interval(s: Any, prm: Any, w0: Vec, f0: Vec, w1: Vec, f1: Vec, dt: f
     """Predict over one interval between raw IMU samples, see `interval`."""
     w, f, rotation, dv = interval(s, prm, w0, f0, w1, f1, dt)
     D, A, B = predict(s, prm, w, f, rotation, dv, dt)
-    if len(s.bank) > 0:
-        inertial.carry(s, D, A, B, dt)
+    carry(s, D, A, B, dt)
     if prm.imu_mean == 0.0:
         unseen(s, prm, w0, f0, w1, f1, dt)
 
@@ -281,8 +280,7 @@ def advance(s: Any, prm: Any, rows: Any, cov: Any, aids: Any, tape: Any, stage: 
     t = m.t
     w1, f1 = (m.w[0], m.w[1], m.w[2]), (m.f[0], m.f[1], m.f[2])
     pop_imu(s)
-    if len(s.model) > 0:
-        rotors_at(s, t)
+    turning(s, t)
     w0, f0 = (s.w_raw[0], s.w_raw[1], s.w_raw[2]), (s.f_raw[0], s.f_raw[1], s.f_raw[2])
     s.w_raw[0], s.w_raw[1], s.w_raw[2] = w1
     s.f_raw[0], s.f_raw[1], s.f_raw[2] = f1
@@ -327,24 +325,18 @@ def advance(s: Any, prm: Any, rows: Any, cov: Any, aids: Any, tape: Any, stage: 
     else:
         node, kind = dt > LONG_STEP or t >= s.t_wake or s.n_since >= NODE_STEPS - 1 or s.n_since * dt >= NODE_SPAN, FOLLOWS
         s.n_since += 1
-        if len(s.pairs) > 0:
-            w0, f0, w1, f1 = stand_in.stand_in(s, prm, w0, f0, w1, f1, dt)
-            s.w_raw[0], s.w_raw[1], s.w_raw[2] = w1
-            s.f_raw[0], s.f_raw[1], s.f_raw[2] = f1
-            if pairs.gather(s, prm, w_raw, f_raw, dt) and pairs.listen(s, prm):
-                model_faults.judge(s, prm)
+        w0, f0, w1, f1 = compare(s, prm, w0, f0, w1, f1, dt)
         north, east = s.v[0], s.v[1]
         if dt > LONG_STEP:
             bridge_gap(s, stage, prm, w0, f0, w1, f1, dt)
         else:
             predict_interval(s, prm, w0, f0, w1, f1, dt)
             predict_stage(s, stage, prm, w0, f0, w1, f1, dt)
-        if len(s.pairs) > 0 and stand_in.stands(s):
-            stand_in.couple(s, prm, dt)
+        couple(s, prm, dt)
         s.yaw.dv[0] += s.v[0] - north
         s.yaw.dv[1] += s.v[1] - east
         if len(s.drag) > 0:
-            if len(s.pairs) > 0 and stand_in.across(s):
+            if across(s):
                 s.air.dt = 0.0  # no drag is measured
             else:
                 drag.gather(s, f1, dt)
@@ -358,10 +350,8 @@ def advance(s: Any, prm: Any, rows: Any, cov: Any, aids: Any, tape: Any, stage: 
                     s.yaw.fresh = 0
                     if prm.aid_yaw_bank > 0.0:
                         yaw_bank.update(s, s.yaw.z[0], s.yaw.z[1], s.yaw.r)
-        if len(s.bank) > 0:
-            found = steps.watch(s, prm, t, dt, w_raw, f_raw)
-            if inertial.tick(s, prm, dt) or found:  # what was before is smoothed by itself
-                node, kind = True, BEGINS
+        if diagnose(s, prm, t, dt, w_raw, f_raw):  # what was before is smoothed by itself
+            node, kind = True, BEGINS
     if t >= s.t_covariance and not sound(s):
         event(s, t, E_DIVERGED, NO_SENSOR, 0.0)
         alignment.begin(s, t)
@@ -477,11 +467,18 @@ def offer(S: Any, PRM: Any, kind: int, t: float, z: Vec, r: Vec) -> int:
 
 
 @jit
-def hear_rotors(s: Any, prm: Any, t: float, speeds: Any) -> int:
-    """Queue the speeds of all rotors by the time they were valid, where there is a vehicle's model to hear them."""
-    if len(s.model) == 0:
-        return 2
+def queue_rotors(s: Any, prm: Any, t: float, speeds: Any) -> int:
+    """Queue the speeds of all rotors by the time they were valid."""
     return push_rotors(s, t - prm.delay_rotors - s.model[0].lag, speeds)
+
+
+@jit
+def hear_no_rotors(s: Any, prm: Any, t: float, speeds: Any) -> int:
+    """There is no model."""
+    return 2
+
+
+hear_rotors = where("model", queue_rotors, hear_no_rotors)
 
 
 @entry
@@ -568,8 +565,7 @@ def now(S: Any, PRM: Any, out: Any) -> None:
     for i in range(s.imu_n):
         m = s.imu[(s.imu_head + i) % len(s.imu)]
         w1, f1 = (m.w[0], m.w[1], m.w[2]), (m.f[0], m.f[1], m.f[2])
-        if len(s.pairs) > 0:
-            w1, f1 = stand_in.hold(s, w0, f0, w1, f1)
+        w1, f1 = hold(s, w0, f0, w1, f1)
         dt = m.t - t
         k = 1.0 if prm.imu_mean > 0.0 else 0.5
         w = (
