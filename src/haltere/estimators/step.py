@@ -331,8 +331,8 @@ def advance(s: Any, prm: Any, rows: Any, cov: Any, aids: Any, tape: Any, stage: 
             w0, f0, w1, f1 = stand_in.stand_in(s, prm, w0, f0, w1, f1, dt)
             s.w_raw[0], s.w_raw[1], s.w_raw[2] = w1
             s.f_raw[0], s.f_raw[1], s.f_raw[2] = f1
-            if pairs.gather(s, prm, w_raw, f_raw, dt) and pairs.listen(s, prm):
-                model_faults.judge(s, prm)
+            if pairs.gather(s, prm, w_raw, f_raw, dt):
+                model_faults.hear(s, prm)
         north, east = s.v[0], s.v[1]
         if dt > LONG_STEP:
             bridge_gap(s, stage, prm, w0, f0, w1, f1, dt)
