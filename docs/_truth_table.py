@@ -28,7 +28,8 @@ from haltere.identify.vehicle import identify_vehicle
 from haltere.metrics.detection import alarms, detections, names, poisson_interval, share_interval
 from haltere.simulate import Scenario, inject, parse_fault, simulate
 
-#: Rows of sensors (0.165 of the field towards east turn a compass by 20 degrees) and of the vehicle: full size, half size, and how late the table's detection is in still air [s].
+#: Rows of sensors and of the vehicle: full size, half size, and how late the table's detection is in still air [s]. A field towards east of
+#: 0.165 of the Earth's turns the compass by 20 degrees.
 SENSOR_ROWS = {
     "gyro.x": ("bias=3deg/s", "bias=1.5deg/s", 0.0), "gyro.y": ("bias=3deg/s", "bias=1.5deg/s", 0.0),
     "gyro.z": ("bias=6deg/s", "bias=3deg/s", 0.0), "accel.x": ("bias=0.8m/s2", "bias=0.4m/s2", 0.1),
@@ -214,8 +215,9 @@ def show(result: Mapping[str, Any]) -> None:
         bad = r["good"] < 0.97 * r["n"]
         counts = " ".join(f"{k} {r[k]}" for k in ("right", "set", "wrong", "none", "missed", "before") if r[k])
         more = (f" {r['names']}" if bad else "") + (f" also {r['also']}" if r["also"] else "")
-        print(f"{'BAD ' if bad else '    '}{'late' if late else '    '} {r['word']:26s} {r['mission']:9s} {r['wind']:5s} {r['good']:3d}/{r['n']:<3d}"
-              f" {counts}; seen {r['seen_mean']} ({r['limit']}), named {r['named_median']}{more}")  # fmt: skip
+        where = f"{r['word']:26s} {r['mission']:9s} {r['wind']:5s} {r['good']:3d}/{r['n']:<3d}"
+        print(f"{'BAD ' if bad else '    '}{'late' if late else '    '} {where} {counts}; seen"
+              f" {r['seen_mean']} ({r['limit']}), named {r['named_median']}{more}")  # fmt: skip
     q = result["quiet"]
     if q["flights"]:
         print(f"{len(q['alarms'])} alarms in {q['hours']} h, {q['interval'][0]:.3f} to {q['interval'][1]:.3f} an hour")

@@ -53,6 +53,8 @@ NONE = constant(-1)
 GRID, OLDEST, EVERY, TELL = 0.25, 15.0, 0.1, 2.5
 #: An inertial fault is named so long [s] after the alarm at the earliest: what is sudden is rather in what was measured.
 SETTLE = 0.4
+#: An accelerometer that alarms sooner than this [s] waits as long as the following.
+SUDDEN = 0.5
 #: And what is measured is found wrong by a fault that lasts so long [s]: a gust on a barometer, a glitch, do not.
 LASTS = 1.2
 #: By how much a name must exceed the others; and for an axis of the gyro against that of the accelerometer which looks most like it.
@@ -324,7 +326,8 @@ def judge(s: Any, prm: Any) -> bool:
         if g != lead and top - b.level[g] < margin:
             candidates |= 1 << g
             others += 1
-    if others == 0 and s.t - b.t_seen >= (SETTLE if lead < F_VELOCITY else LASTS):
+    sudden = lead >= F_ACCEL and b.t_seen - b.onset[k] < SUDDEN  # as what was measured is, and hardly an accelerometer
+    if others == 0 and s.t - b.t_seen >= (SETTLE if lead < F_VELOCITY and not sudden else LASTS):
         return name(s, prm, lead)
     if b.alarm == 1 and s.t - b.t_seen > TELL:
         b.alarm = 2

@@ -17,9 +17,10 @@ from haltere._jit import constant, jit
 from haltere.aids import compass
 from haltere.aids.compass import OUT_TURN
 from haltere.aids.record import E_FAULT, E_OVER, E_SUSPECT, NO_SENSOR, event_since
-from haltere.diagnosis.pairs import calm_again, change, listen, shift_bias, would_show
-from haltere.diagnosis.rate_step import shape
-from haltere.diagnosis.stand_in import density_of_noise, offset_variance
+from haltere.diagnosis import doubt
+from haltere.diagnosis.pairs import BLOCK, calm_again, change, listen, shift_bias, would_show
+from haltere.diagnosis.rate_step import began, shape
+from haltere.diagnosis.stand_in import density_of_noise, mark_before, offset_variance
 from haltere.diagnosis.wind_or_force import WIND, best, follow, start
 from haltere.filter.signatures import ACCEL, SLOTS, clear
 from haltere.strapdown.propagate import gusts, inject
@@ -38,11 +39,15 @@ CANDIDATES = (
 )  # fmt: skip
 B_WIND, B_ACCEL, B_GYRO, B_ROTOR, B_TACHOMETER, B_COMPASS = (constant(i) for i in (6, 7, 10, 13, 21, 29))
 #: When a change is looked at first, and when a verdict on moments is given [s]; how long one on forces may wait, and one on a rotor.
-EARLY, COLLECT, WAIT, LONGER = 0.08, 0.3, 4.0, 2.0
+EARLY, COLLECT, WAIT, LONGER = 0.08, 0.3, 6.0, 2.0
 #: How long a force and wind are compared at the most before both are named [s].
 COMPARED = 2.5
 #: By how much a hypothesis must explain better, in twice the log likelihood; what a signature is off by itself, and least 1 sigma.
 MARGIN, LIKE, LEAST_M, LEAST_F = 9.0, 0.2, 0.15, 0.04
+#: Two rotors that explain alike within the first are both named, within the second they are looked at for longer.
+NEARLY, UNLIKE = 1.0, 3.0
+#: A moment that has lasted for so long [s] before its alarm is dated anew.
+OLD = 0.5
 #: Least change of a rotor's thrust that is a fault.
 LEAST_ROTOR = 0.015
 #: 1 sigma of what a rotor that has lost thrust has lost of its torque, beside that.
@@ -57,8 +62,14 @@ POWER, AGAINST = 2.33, 16.0
 REVERSE = 0.4
 #: A step of the gyro and the onset of what turned the compass are one if so near [s]; part of a step that its size may be off by.
 AROUND_OUT, UNSURE = 5.0, 0.2
+#: For how long what was done about one fault may turn the compass [s].
+HEALS = 10.0
 #: How much earlier than the window of an alarm a step may be [s]; what a force of the air off the centre turns [rad/s^2 per m/s^2].
 AROUND, OFF_CENTRE = 0.1, 0.6
+#: Gusts push so many sigma of theirs; a finding below this part of a rotor's fault that is carried is its change.
+AS_GUSTS, PART = 1.5, 0.6
+#: What the model of a moment is off by as a part of the largest of late: constants, and the time of a rotor's speed.
+HARD = 0.05
 UP, FORCES, T, R, P, Q = (constant(i) for i in (1, 3, 2, 3, 4, 5))
 
 
@@ -72,6 +83,8 @@ def hear(s: Any, prm: Any) -> None:
         if p.trial == 1:
             follow(s, dt)
         judge(s, prm)
+    if len(s.bank) > 0 and s.bank[0].healed != p.healed_out:
+        p.healed_out, p.t_healed = s.bank[0].healed, s.t
     if s.compass.out != p.out:
         p.out = s.compass.out
         if p.out == OUT_TURN:
@@ -82,6 +95,8 @@ def hear(s: Any, prm: Any) -> None:
 def compass_or_gyro(s: Any, prm: Any) -> None:
     """The compass turned against the gyro and was put out: which of them it was, if the rotors say."""
     p, c = s.pairs[0], s.compass
+    if s.t < p.t_healed + HEALS:
+        return  # what was done about another fault has turned it
     if p.t_step[2] > c.onset - AROUND_OUT and p.on[2] == 0:
         name_gyro(s, 2)
         return
@@ -136,10 +151,11 @@ def judge(s: Any, prm: Any) -> None:
     since = s.t - p.t_first
     if len(s.bank) > 0 and s.bank[0].healed != p.healed:  # an inertial fault was named meanwhile: it explains this
         settle(s)
+        p.t_across = s.t
         return
     if since < COLLECT:
         return
-    if p.mark < 0:
+    if p.mark < 0 or (len(s.bank) > 0 and doubt.near_ground(s)):
         settle(s)
         return
     moments, late = False, False
@@ -248,11 +264,17 @@ def lift(s: Any, k: int, thrust: float, m_q: float, s_q: float) -> None:
 def of_moments(s: Any, prm: Any) -> bool:
     """A gyro axis, a moment of the model, or a rotor; False where it is not clear yet which rotor."""
     p = s.pairs[0]
+    if p.t_first - p.onset > OLD:  # a long window was full already: it says nothing of when
+        for i in range(R, 6):
+            if p.t_alarm[i] == p.t_first:
+                p.onset = began(p, i - R, p.m_drift[p.mark, i])
+                p.mark = max(mark_before(p, p.onset - 2.0 * BLOCK), 0)
     m_r, s_r = moment_of(s, R)
     m_p, s_p = moment_of(s, P)
     m_q, s_q = moment_of(s, Q)
     span = max(s.t - p.onset, EARLY)
-    f, s_f = change(s, T), math.sqrt(density_of_noise(s, T) / span + LEAST_F * LEAST_F)
+    lasting = density_of_noise(s, T) * min(1.0, p.scale[T]) + p.r[T] * BLOCK
+    f, s_f = change(s, T), math.sqrt(lasting / span + LEAST_F * LEAST_F)
     alarmed = (p.t_alarm[R] != 0.0) + (p.t_alarm[P] != 0.0) + (p.t_alarm[Q] != 0.0)
     for i in range(R, 6):  # a rate that steps and stays, and the other axes keep quiet
         if p.t_alarm[i] != 0.0 and alarmed == 1:
@@ -264,7 +286,7 @@ def of_moments(s: Any, prm: Any) -> bool:
                 return True
             if better > -MARGIN:
                 return True  # it may be the gyro's: the bank will say so
-    first, least, second, thrust = -1, 1e18, 1e18, 0.0
+    first, other, least, second, thrust = -1, -1, 1e18, 1e18, 0.0
     for k in range(min(len(s.speed), MOST)):
         g = signature(s, k)
         weight = (1.0 / (s_r * s_r), 1.0 / (s_p * s_p), 1.0 / (s_f * s_f))
@@ -274,9 +296,9 @@ def of_moments(s: Any, prm: Any) -> bool:
         d = (g[0] * m_r * weight[0] + g[1] * m_p * weight[1] + g[2] * f * weight[2]) / den
         left = misfit(m_r, d * g[0], s_r) + misfit(m_p, d * g[1], s_p) + misfit(f, d * g[2], s_f)
         if left < least:
-            first, least, second, thrust = k, left, least, d
+            first, other, least, second, thrust = k, first, left, least, d
         elif left < second:
-            second = left
+            other, second = k, left
     nothing = (m_r / s_r) * (m_r / s_r) + (m_p / s_p) * (m_p / s_p) + (f / s_f) * (f / s_f)
     alone = (nothing - (m_r / s_r) * (m_r / s_r), nothing - (m_p / s_p) * (m_p / s_p), nothing)
     spread = (m_q / s_q) * (m_q / s_q)
@@ -287,16 +309,38 @@ def of_moments(s: Any, prm: Any) -> bool:
         axis, single = P, alone[1] + spread
     if p.t_alarm[Q] == 0.0 and axis == Q:
         axis, single = (R, alone[0]) if abs(m_r / s_r) > abs(m_p / s_p) else (P, alone[1])
-    if first >= 0 and least + MARGIN < single and abs(thrust) > LEAST_ROTOR:
-        if second - least < MARGIN and s.t - p.t_first < LONGER:
+    pushed = AS_GUSTS * (by_gusts(s, prm, 0) + by_gusts(s, prm, 1))
+    pushed += (abs(p.told_size[0]) if p.t_alarm[0] != 0.0 else 0.0) + (abs(p.told_size[1]) if p.t_alarm[1] != 0.0 else 0.0)
+    least_moment = prm.diagnosis_moment + OFF_CENTRE * pushed + HARD * p.hard
+    carried = -1
+    for k in range(min(len(s.speed), MOST)):
+        if (p.wrong >> (6 + k)) & 1 == 1:
+            carried = k
+    if carried >= 0 and p.lifted == 1:  # its thrust is not what was found by so much, or goes with speed in another way
+        g = signature(s, carried)
+        small = abs(m_r) < PART * abs(p.lift[carried] * g[0]) and abs(m_p) < PART * abs(p.lift[carried] * g[1])
+        if small and (first != carried or abs(thrust) < PART * abs(p.lift[carried])):
+            weight = (1.0 / (s_r * s_r), 1.0 / (s_p * s_p), 1.0 / (s_f * s_f))
+            den = g[0] * g[0] * weight[0] + g[1] * g[1] * weight[1] + g[2] * g[2] * weight[2]
+            lift(s, carried, (g[0] * m_r * weight[0] + g[1] * m_p * weight[1] + g[2] * f * weight[2]) / den, m_q, s_q)
+            return True
+    turns = 0.0
+    if first >= 0:
+        g = signature(s, first)
+        turns = abs(thrust) * math.sqrt(g[0] * g[0] + g[1] * g[1])
+    if first >= 0 and least + MARGIN < single and abs(thrust) > LEAST_ROTOR and turns > least_moment:
+        if second - least < UNLIKE and s.t - p.t_first < LONGER:
             return False
+        if second - least < NEARLY:
+            both = (UP << (B_ROTOR + first)) | (UP << (B_ROTOR + other)) | (UP << (B_TACHOMETER + first)) | (UP << (B_TACHOMETER + other))
+            tell(s, E_SUSPECT, ROTOR + first, thrust, 0.02, both)
+            return True
         bits = (UP << (B_ROTOR + first)) | (UP << (B_TACHOMETER + first))
         conclude(s, 6 + first, ROTOR + first, thrust, 0.02, bits, E_FAULT)
         lift(s, first, thrust, m_q, s_q)
         return True
     size, sd = (m_r, s_r) if axis == R else ((m_p, s_p) if axis == P else (m_q, s_q))
-    pushed = (abs(p.told_size[0]) if p.t_alarm[0] != 0.0 else 0.0) + (abs(p.told_size[1]) if p.t_alarm[1] != 0.0 else 0.0)
-    if abs(size) > prm.diagnosis_moment + OFF_CENTRE * pushed:
+    if abs(size) > least_moment:
         conclude(s, axis, MODEL + axis, size, sd, UP << axis, E_FAULT)
     return True
 
@@ -353,7 +397,7 @@ def of_forces(s: Any, prm: Any, since: float) -> None:
         for i in range(FORCES):
             a = i if abs(p.told_size[i]) > abs(p.told_size[a]) else a
         still = W[0] * W[0] + W[1] * W[1] < STILL * STILL and p.t_flying < p.onset - STILL_FOR
-        p.still = 1 if (still or a == T) and abs(p.told_size[a]) > BEYOND_GUSTS * by_gusts(s, prm, a) else -1
+        p.still = 1 if still and abs(p.told_size[a]) > by_gusts(s, prm, a) else -1
         if p.still == 1:
             start(s)
             return
@@ -370,7 +414,7 @@ def of_forces(s: Any, prm: Any, since: float) -> None:
         settle_forces(s)
         return
     size = p.push[a]
-    if abs(size) < 0.5 * prm.diagnosis_force and since > 1.0:  # gone by itself
+    if since > 1.0 and abs(size) < max(0.5 * prm.diagnosis_force, BEYOND_GUSTS * by_gusts(s, prm, a)):  # gusts, or gone by itself
         settle_forces(s)
         return
     if len(s.bank) > 0 and s.bank[0].alarm != 0 and since < WAIT:  # an inertial fault is about to be named
@@ -379,12 +423,11 @@ def of_forces(s: Any, prm: Any, since: float) -> None:
     windy = gap < MARGIN or len(s.wind) == 0
     if (windy and since < COMPARED) or (others < MARGIN and since < COMPARED):
         return
-    if quiet == 1:
+    if quiet == 1 and abs(size) > BEYOND_GUSTS * by_gusts(s, prm, a):
         candidates = (UP << a) | ((UP << B_WIND) if windy else 0)
         conclude(s, a, MODEL + a, size, 0.05, candidates, E_SUSPECT if windy else E_FAULT)
         settle_forces(s)
     elif since > WAIT:
-        if quiet == 0:
-            candidates = (UP << a) | (UP << (B_ACCEL + a)) | ((UP << B_WIND) if windy else 0)
-            conclude(s, a, MODEL + a, size, 0.05, candidates, E_SUSPECT)
+        if quiet == 0 and not windy:  # three that it may be are no verdict
+            conclude(s, a, MODEL + a, size, 0.05, (UP << a) | (UP << (B_ACCEL + a)), E_SUSPECT)
         settle_forces(s)

@@ -27,23 +27,25 @@ BLOCK, MARK = 0.01, 0.25
 #: Biases are held for so long [s]; blocks until a chain is known; time in the air before [s].
 HELD, WARM, AIRBORNE = 5.0, 200, 2.0
 #: An offset walks by its 1 sigma in this time [s]; 1 sigma of one that begins anew, in those.
-WALK, ANEW = 5.0, 10.0
+WALK, ANEW, ANEW_MOMENT = 5.0, 10.0, 30.0
 #: Memory of what innovations come to, and of the noise of a block, in blocks; how far a lone one may move it.
 LEARN, NOISE, LONE = 2000.0, 500.0, 9.0
 #: And the shortest of the first, at the beginning.
 EARLY_LEARN = 100.0
-#: How fast the noise of a moment's chain follows the flight, a part a block, at first and later; its bounds, over the vehicle file's.
+#: How fast the noise of a chain follows the flight, a part a block, at first and later; its bounds, over the vehicle file's.
 QUICK, SETTLED, LEAST_SCALE, MOST_SCALE = 0.2, 0.02, 0.01, 4.0
 #: Most correlation of neighbours that is taken out.
 MOST_RHO = 0.9
 #: As in `haltere.diagnosis.inertial`: over how many usual ones a threshold is, stretch [s], how fast that is learnt, its bound.
 BEYOND_USUAL, STRETCH, RISE, FALL, CAP = 2.0, 10.0, 0.6, 0.1, 2.0
+#: What is left of the largest moment of late, a block.
+HARD_FOR = 0.98
 #: Forces are compared in the wind of so long ago [s].
 LAG = 1.0
 #: Memory of gusts [s].
 STIR = 20.0
 #: A wind that changed, or was taken for one, is found again and again for so long [s]: forces are not judged meanwhile.
-FOLLOWS = 15.0
+FOLLOWS = 5.0
 #: Least part of the gusts expected that are taken for there.
 CALMEST = 0.2
 #: And the most of them with which forces are held against an accelerometer.
@@ -52,6 +54,8 @@ CALM_ENOUGH = 0.4
 FOUND, POWER = 0.6, 2.33
 #: An onset of the bank of signatures is on a grid of so many seconds; an alarm of the pair is that of a fault if it came so long after.
 GRID, HINTED = 0.25, 1.0
+#: And a fault that it would show must have shown within this time.
+SHOWS = 0.5
 #: Rotors and gyro agree if no detector of theirs alarmed for so long [s].
 AGREED = 5.0
 FORCES, AXES = constant(3), constant(6)
@@ -61,7 +65,7 @@ FORCES, AXES = constant(3), constant(6)
 def calm_again(s: Any, i: int) -> None:
     """Begin the chain of a pair anew: whatever its offset is now is what it is compared with."""
     p = s.pairs[0]
-    v = offset_variance(s, i) * ANEW * ANEW
+    v = offset_variance(s, i) * (ANEW * ANEW if i < FORCES else ANEW_MOMENT * ANEW_MOMENT)
     p.P[i, 0], p.P[i, 1], p.P[i, 2] = v if i < FORCES else 1.0, 0.0, v
     p.z[i], p.t_alarm[i] = 0.0, 0.0
     empty(p.w[i])
@@ -118,7 +122,9 @@ def restart(s: Any) -> None:
     p = s.pairs[0]
     p.t_across = -1e9
     p.n, p.span, p.t_first, p.t_bias, p.stir, p.calm, p.n_stir, p.n_blocks, p.trial = 0.0, 0.0, 0.0, -1e9, 1.0, 1.0, 0.0, 0, 0
-    p.out = s.compass.out
+    p.hard = 0.0
+    p.out, p.t_healed = s.compass.out, -1e9
+    p.healed_out = s.bank[0].healed if len(s.bank) > 0 else 0
     for i in range(6):
         p.sum[i], p.drift[i], p.level[i], p.told_size[i], p.t_hint[i] = 0.0, 0.0, 0.0, 0.0, -1e9
         calm_again(s, i)
@@ -133,9 +139,7 @@ def restart(s: Any) -> None:
 def chain(s: Any, i: int, y: float, dt: float) -> float:
     """Take a block's residual into the chain of a pair; the innovation."""
     p = s.pairs[0]
-    q = offset_variance(s, i) / WALK * dt
-    if i >= FORCES:
-        q *= p.scale[i]
+    q = offset_variance(s, i) / WALK * dt * p.scale[i]
     if i < FORCES:
         p.P[i, 0] += q
         S = p.P[i, 0] + p.r[i]
@@ -202,9 +206,9 @@ def listen(s: Any, prm: Any) -> bool:
             x = min(max(z * p.z[i], -LONE * p.c0[i]), LONE * p.c0[i])
             p.c0[i] += rate * (min(z * z, LONE * p.c0[i]) - p.c0[i])
             p.c1[i] += rate * (x - p.c1[i])
-            if i >= FORCES:  # neighbours that are alike: the chain is too slow for what the model leaves; that alternate: too quick
-                quick = min(QUICK, max(SETTLED, EARLY_LEARN * rate * QUICK))
-                p.scale[i] = min(max(p.scale[i] * (1.0 + quick * x / p.c0[i]), LEAST_SCALE), MOST_SCALE)
+            # neighbours that are alike: the chain is too slow for what the model leaves; that alternate: too quick
+            quick = min(QUICK, max(SETTLED, EARLY_LEARN * rate * QUICK))
+            p.scale[i] = min(max(p.scale[i] * (1.0 + quick * x / p.c0[i]), LEAST_SCALE), 1.0 if i < FORCES else MOST_SCALE)
         p.z[i] = z
         rho = min(max(p.c1[i] / p.c0[i], 0.0), MOST_RHO)
         glr = take(p.w[i], (z / math.sqrt(p.c0[i]), 0.0, 0.0), 1, rho)
@@ -224,6 +228,9 @@ def listen(s: Any, prm: Any) -> bool:
                     p.statistic, p.threshold = glr, factor * prm.diagnosis_pair_threshold
                     p.mark = mark_before(p, p.onset - 2.0 * BLOCK)
                     p.healed = s.bank[0].healed if len(s.bank) > 0 else 0
+    p.hard *= HARD_FOR
+    for i in range(FORCES):
+        p.hard = max(p.hard, abs(p.m[i]))
     k = p.n_lately % LATELY
     for i in range(FORCES):
         p.lately[k, i] = p.residual[FORCES + i]
@@ -320,7 +327,7 @@ def contradicted(s: Any, prm: Any, g: int, size: float, onset: float) -> bool:
         return False
     p = s.pairs[0]
     i = 3 + g if g < FORCES else g - 3
-    if s.t < onset + HINTED or onset < p.t_calm + 2.0 or p.any != 0:
+    if s.t < onset + SHOWS or onset < p.t_calm + 2.0 or p.any != 0:
         return False
     if i < FORCES and (s.t - p.t_across < FOLLOWS or p.calm > CALM_ENOUGH):
         return False

@@ -11,18 +11,23 @@ from typing import Any
 from haltere._jit import constant, jit
 from haltere.strapdown.pairs import LATELY
 
-__all__ = ["shape"]
+__all__ = ["began", "shape"]
 
 #: Blocks before an onset at the least, and after it.
 BEFORE, AFTER = 12, 8
 #: How long a moment lasts that is set against a step [s]: these, and until now.
-PULSES = (0.06, 0.12, 0.24, 1e3)
+LASTS = 1e3
+PULSES = (0.06, 0.12, 0.24, LASTS)
 FORCES = constant(3)
 
 
 @jit
 def fit(p: Any, a: int, first: int, onset: int, drift: float, rise: float) -> tuple[float, float]:
-    """Squares that a change within ``rise`` seconds from block ``onset`` on leaves, and its size; 0 for a step."""
+    """Squares that a change within ``rise`` seconds from block ``onset`` on leaves, and its size; 0 for a step of the gyro.
+
+    The model is damped by the rate that it is told: after a false step of b its own moment is wrong by b ∂ω̇/∂ω.
+    """
+    damped = p.by_w[a, a]
     n = p.n_lately
     sb, nb = 0.0, 0.0
     t0 = p.t_lately[onset % LATELY]
@@ -34,7 +39,7 @@ def fit(p: Any, a: int, first: int, onset: int, drift: float, rise: float) -> tu
     xy, xx = 0.0, 0.0
     for k in range(onset + 1, n):
         j = k % LATELY
-        g = 1.0 if rise <= 0.0 else min((p.t_lately[j] - t0) / rise, 1.0)
+        g = 1.0 - damped * (p.t_lately[j] - t0) if rise <= 0.0 else min((p.t_lately[j] - t0) / rise, 1.0)
         xy += g * (p.lately[j, a] - drift * (p.t_lately[j] - t0) - base)
         xx += g * g
     size = xy / xx
@@ -43,7 +48,9 @@ def fit(p: Any, a: int, first: int, onset: int, drift: float, rise: float) -> tu
         if k == onset:
             continue
         j = k % LATELY
-        g = 0.0 if k < onset else (1.0 if rise <= 0.0 else min((p.t_lately[j] - t0) / rise, 1.0))
+        g = 0.0
+        if k > onset:
+            g = 1.0 - damped * (p.t_lately[j] - t0) if rise <= 0.0 else min((p.t_lately[j] - t0) / rise, 1.0)
         x = p.lately[j, a] - drift * (p.t_lately[j] - t0) - base - g * size
         left += x * x
     return left, size
@@ -72,3 +79,16 @@ def shape(p: Any, a: int, drift: float, begin: float) -> tuple[float, float, flo
         return 0.0, 0.0, 0.0
     noise = max(p.c0[FORCES + a], step / (n - first - 3.0))
     return (ramp - step) / noise, size, when
+
+
+@jit
+def began(p: Any, a: int, drift: float) -> float:
+    """When a moment began that still lasts, of rate axis ``a``: the onset of the ramp that fits best [s]."""
+    n = p.n_lately
+    first = max(0, n - int(LATELY))
+    least, when = 1e18, p.onset
+    for onset in range(first + BEFORE, n - AFTER):
+        left, _ = fit(p, a, first, onset, drift, LASTS)
+        if left < least:
+            least, when = left, p.t_lately[onset % LATELY]
+    return float(when)

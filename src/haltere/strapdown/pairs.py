@@ -42,6 +42,7 @@ def pairs() -> np.dtype[np.void]:
                 ("v_a", "f8", 3),
                 ("by_v", "f8", (2, 3, 3)),
                 ("by_w", "f8", (3, 3)),
+                ("hard", "f8"),  # largest moment of late [rad/s^2]
                 ("turn", "f8", 3),  # integral of the model's moment [rad/s]
                 # thrust that rotors were found to have more than their speeds stand for, as a part, and the same of their torque
                 ("lift", "f8", 8),
@@ -106,6 +107,8 @@ def pairs() -> np.dtype[np.void]:
                 ("blown_var", "f8", 3),
                 ("wind", "f8", 2),
                 ("healed", "i8"),
+                ("healed_out", "i8"),
+                ("t_healed", "f8"),
                 ("still", "i8"),  # of forces across the thrust axis: 1 the air was still, -1 it was not, 0 not looked at
                 # faults of the model that last: bits by axis, then by rotor, and sizes
                 ("wrong", "i8"),
