@@ -208,6 +208,33 @@ def summary(lines: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
     }  # fmt: skip
 
 
+def page(result: Mapping[str, Any]) -> str:
+    """The tables of the page on the vehicle's model, as Markdown."""
+    lines = ["| size | mission | air | runs | right | set | wrong | nothing |", "|---" * 8 + "|"]
+    groups: dict[tuple[str, str, str], list[Mapping[str, Any]]] = {}
+    for r in result["rows"]:
+        groups.setdefault((r["size"], r["mission"], r["wind"]), []).append(r)
+    for key, rows in sorted(groups.items()):
+        total = {k: sum(r[k] for r in rows) for k in ("n", "right", "set", "wrong", "none", "missed")}
+        counts = (total["n"], total["right"], total["set"], total["wrong"], total["none"] + total["missed"])
+        lines.append("| " + " | ".join([*key, *map(str, counts)]) + " |")
+    heads = ["fault", "mission", "air", "right", "seen after, mean (allowed) [s]", "named after [s]", "what was named"]
+    lines += ["", "| " + " | ".join(heads) + " |", "|---" * len(heads) + "|"]
+    for r in result["rows"]:
+        late = r["limit"] is not None and r["seen_mean"] is not None and r["seen_mean"] > r["limit"]
+        if r["good"] >= 0.97 * r["n"] and not late:
+            continue
+        told = ", ".join(f"{w.replace(' ', ' or ')}: {n}" for w, n in r["names"].items()).replace("-:", "nothing:")
+        seen = f"{r['seen_mean'] if r['seen_mean'] is not None else '–'}" + (f" ({r['limit']})" if r["limit"] is not None else "")
+        cells = [f"`{r['word']}`", r["mission"], r["wind"], f"{r['good']} of {r['n']}", seen, str(r["named_median"] or "–"), told]
+        lines.append("| " + " | ".join(cells) + " |")
+    q = result["quiet"]
+    words = f"{len(q['alarms'])} alarms in {q['hours']:.1f} h without a fault (half in gusts): "
+    lines += ["", f"{words}{q['interval'][0]:.2f} to {q['interval'][1]:.2f} an hour with 95 %."]
+    lines += ["", f"Seeds {result['seeds'][0]} to {result['seeds'][1]}, IMU at 250 Hz, commit {', '.join(result['commits'])}."]
+    return "\n".join(lines)
+
+
 def show(result: Mapping[str, Any]) -> None:
     """The rows on the screen, the bad ones with what was named."""
     for r in result["rows"]:
