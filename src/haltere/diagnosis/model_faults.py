@@ -18,7 +18,7 @@ from haltere.aids import compass
 from haltere.aids.compass import OUT_TURN
 from haltere.aids.record import E_FAULT, E_OVER, E_SUSPECT, NO_SENSOR, event_since
 from haltere.diagnosis import doubt
-from haltere.diagnosis.pairs import BLOCK, calm_again, change, listen, shift_bias, would_show
+from haltere.diagnosis.pairs import BLOCK, CALM_ENOUGH, calm_again, change, listen, shift_bias, would_show
 from haltere.diagnosis.rate_step import began, shape
 from haltere.diagnosis.stand_in import density_of_noise, mark_before, offset_variance
 from haltere.diagnosis.wind_or_force import WIND, best, follow, start
@@ -281,7 +281,7 @@ def of_moments(s: Any, prm: Any) -> bool:
             better, step, onset = shape(p, i - R, p.m_drift[p.mark, i], p.onset - AROUND)
             if better > -MARGIN:
                 p.t_step[i - R], p.step[i - R] = onset, step
-            if better > MARGIN and abs(step) > prm.diagnosis_gyro:
+            if better > MARGIN and abs(step) > prm.diagnosis_gyro and p.calm <= CALM_ENOUGH:
                 name_gyro(s, i - R)
                 return True
             if better > -MARGIN:

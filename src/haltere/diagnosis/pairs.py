@@ -20,7 +20,20 @@ from haltere.filter.windows import empty, take
 from haltere.strapdown.pairs import LATELY, MARKS
 from haltere.strapdown.propagate import gusts
 
-__all__ = ["BLOCK", "calm_again", "change", "contradicted", "gather", "hinted", "listen", "restart", "shift_bias", "vouch", "would_show"]
+__all__ = [
+    "BLOCK",
+    "CALM_ENOUGH",
+    "calm_again",
+    "change",
+    "contradicted",
+    "gather",
+    "hinted",
+    "listen",
+    "restart",
+    "shift_bias",
+    "vouch",
+    "would_show",
+]
 
 #: A block, and time between marks of the past [s].
 BLOCK, MARK = 0.01, 0.25
