@@ -48,13 +48,12 @@ def told(of: Vehicle, word: str, mission: str = "box", end: float = 8.0, **wind:
 )
 def test_faults_of_model_and_rotor_are_named(identified: Vehicle, word: str, sensor: str, axis: str, candidates: list[str]) -> None:
     e, *later = told(identified, word)
-    assert sensor == "rotors" or not later  # after a rotor, moments that go with its speed are still named: docs/vehicle-model.md
+    assert not later
     assert (e["sensor"], e["axis"], e["candidates"]) == (sensor, axis, candidates)
-    assert 0.0 <= e["t_detected"] - AT < 0.25 and e["t_isolated"] - AT < (2.5 if axis == "t" else 0.6)
+    assert 0.0 <= e["t_detected"] - AT < 0.25 and e["t_isolated"] - AT < (2.5 if axis == "t" else 1.1)
     assert e["statistic"] > e["threshold"] and "silent" in e["evidence"] and "J1" in e["evidence"]
 
 
-@pytest.mark.xfail(strict=True, reason="the bank's power is overrated in the first second: model.t is named before accel.z")
 def test_an_accelerometer_is_not_taken_for_the_model(identified: Vehicle) -> None:
     (e,) = told(identified, f"accel.z:bias=0.8m/s2@{AT:g}")
     assert e["candidates"] == ["accel.z"]
@@ -72,6 +71,7 @@ def test_wind_convicts_nobody(identified: Vehicle) -> None:
     assert not told(identified, "", n=5.2, e=3.0, gust=1.2)
 
 
+@pytest.mark.xfail(strict=True, reason="the end of a moment's fault is told 1.8 s late since the chains follow the flight's own noise")
 def test_a_fault_that_ends_is_over(identified: Vehicle) -> None:
     events = told(identified, f"model.r:bias=3rad/s2@{AT:g}-{AT + 6:g}", end=14.0)
     assert [e["axis"] for e in events] == ["r"]

@@ -38,7 +38,8 @@ def _of(fault: int) -> tuple[int, tuple[str, str, float]]:
 def findings(kind: str, record: np.void, events: list[dict[str, Any]]) -> None:
     """Append a finding to the events, or complete the one that told of it before as one of several."""
     if int(record["detail"]) >= MODEL:
-        of_the_model(kind, record, events)
+        if (gyro := of_the_model(kind, record, events)) is not None:
+            _revise(events, gyro)
         return
     if int(record["detail"]) >= STEP:
         _of_samples(kind, record, events)
@@ -73,8 +74,8 @@ def findings(kind: str, record: np.void, events: list[dict[str, Any]]) -> None:
 
 
 def _suspected(event: dict[str, Any]) -> bool:
-    """Whether an event is one of this module's that is not settled."""
-    return event["t_isolated"] is None and event["sensor"] in ("gyro", "accel") and len(event["candidates"]) > 1
+    """Whether an event is of an inertial sensor, or of a vehicle's model beside it, and is not settled."""
+    return event["t_isolated"] is None and event["sensor"] in ("gyro", "accel", "model") and len(event["candidates"]) > 1
 
 
 def _revise(events: list[dict[str, Any]], named: dict[str, Any]) -> None:

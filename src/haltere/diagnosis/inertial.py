@@ -17,7 +17,7 @@ from haltere.aids.fusing import DISTRUSTED, RUNNING
 from haltere.aids.magnetometer import heading_row
 from haltere.aids.record import E_FAULT, E_SUSPECT, GNSS_POSITION, GNSS_VELOCITY, NO_SENSOR, event_since
 from haltere.core.rotation import Mat, dcm
-from haltere.diagnosis import doubt, steps
+from haltere.diagnosis import doubt, pairs, steps
 from haltere.diagnosis.heading import by_heading, gyro_that_turns
 from haltere.diagnosis.healing import follow, heal, heal_between
 from haltere.diagnosis.steps import refuted, shown
@@ -53,6 +53,8 @@ NONE = constant(-1)
 GRID, OLDEST, EVERY, TELL = 0.25, 15.0, 0.1, 2.5
 #: An inertial fault is named so long [s] after the alarm at the earliest: what is sudden is rather in what was measured.
 SETTLE = 0.4
+#: An accelerometer that alarms sooner than this [s] waits as long as the following.
+SUDDEN = 0.5
 #: And what is measured is found wrong by a fault that lasts so long [s]: a gust on a barometer, a glitch, do not.
 LASTS = 1.2
 #: By how much a name must exceed the others; and for an axis of the gyro against that of the accelerometer which looks most like it.
@@ -62,6 +64,8 @@ MARGIN, MARGIN_ALIKE = 9.0, 16.0
 SHOWN, LINEAR = 25.0, 0.02
 #: Changes that are no fault: slopes, as those of a bias over so long [s]; GNSS velocity [m/s], position [m], heading [rad], height [m].
 RAMP_TIME, VELOCITY_FREE, POSITION_FREE, HEADING_FREE, HEIGHT_FREE = 30.0, 0.7, 1.2, 0.1, 1.0
+#: Part of them while the vehicle's model agrees with the IMU.
+VOUCHED = 0.4
 #: Largest steps [rad/s, m/s^2], steepest ramps [rad/s^2, m/s^3].
 GYRO_MOST, ACCEL_MOST = 1.0, 8.0
 GYRO_STEEPEST, ACCEL_STEEPEST = math.radians(0.3), 0.12
@@ -233,10 +237,13 @@ def weigh(s: Any, prm: Any) -> tuple[int, float]:
         b.level[g], b.beyond[g], b.fault[g], b.slot[g] = 0.0, 0.0, NONE, 0
     b.ratio, tilting = 0.0, 0.0
     heard = s.has_field == 1 and s.compass.out == 0 and s.t - b.t_heading < 0.5
+    sure = pairs.vouch(s)
     row = heading_row(dcm((s.q[0], s.q[1], s.q[2], s.q[3])), s.field[0], s.field[1])
     for f in range(N_FAULTS):
         g = family_of(f)
         tolerance, largest, least = free(prm, f), most(f), 0.25 * prm.diagnosis_threshold
+        if sure and f >= VELOCITY:
+            tolerance *= VOUCHED
         h = prm.diagnosis_threshold * (1.0 if g < F_VELOCITY else OTHERS)
         for k in range(SLOTS):
             j = f * SLOTS + k
@@ -247,6 +254,8 @@ def weigh(s: Any, prm: Any) -> tuple[int, float]:
                 size = min(num / den, largest)
                 level = size * (2.0 * num - size * den)  # twice the gain in log likelihood; num²/den where the size is free
                 if f < GYRO_RAMP and refuted(b, f, math.copysign(size, b.num[j]), b.onset[k] - span, b.onset[k] + span):
+                    continue
+                if f < GYRO_RAMP and pairs.contradicted(s, prm, g, size, b.onset[k]):
                     continue
                 said = 0.0
                 if heard and f < VELOCITY:
@@ -262,7 +271,7 @@ def weigh(s: Any, prm: Any) -> tuple[int, float]:
     if tilting < b.level[F_COMPASS]:
         b.ratio = 0.0
     for g in range(F_ACCEL):
-        if b.beyond[g] > 0.5 and in_samples(s, g):
+        if b.beyond[g] > 0.5 and (in_samples(s, g) or pairs.hinted(s, g, b.onset[b.slot[g]]) >= 0.0):
             b.level[g] += SHOWN
     lead, ratio = 0, 0.0
     for g in range(N_FAMILIES):
@@ -317,7 +326,8 @@ def judge(s: Any, prm: Any) -> bool:
         if g != lead and top - b.level[g] < margin:
             candidates |= 1 << g
             others += 1
-    if others == 0 and s.t - b.t_seen >= (SETTLE if lead < F_VELOCITY else LASTS):
+    sudden = lead >= F_ACCEL and b.t_seen - b.onset[k] < SUDDEN  # as what was measured is, and hardly an accelerometer
+    if others == 0 and s.t - b.t_seen >= (SETTLE if lead < F_VELOCITY and not sudden else LASTS):
         return name(s, prm, lead)
     if b.alarm == 1 and s.t - b.t_seen > TELL:
         b.alarm = 2
@@ -341,6 +351,9 @@ def tell(s: Any, prm: Any, code: Any, g: int, candidates: int) -> None:
     if s.n_events > n:
         e = s.event[n]
         e.seen, e.size, e.sd, e.candidates = max(b.t_seen, b.onset[k]), b.num[j] / b.den[j], 1.0 / math.sqrt(b.den[j]), candidates
+        hint = pairs.hinted(s, g, b.onset[k]) if g < F_VELOCITY else -1.0  # the vehicle's model said so before
+        if hint >= 0.0:
+            e.seen = min(e.seen, hint)
         e.left = doubt.left(b, j, k) / max(b.num[j] * b.num[j] / b.den[j], 1e-9)
 
 

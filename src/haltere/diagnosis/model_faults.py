@@ -2,9 +2,10 @@
 
 After the first alarm the others are waited for (theory.md §5.5, theory-amendments.md 2, 3, 16). A level of a rate that has stepped and
 stays is the gyro's; one that goes on is a moment that the model does not have. Roll, pitch and thrust in the ratio of one rotor are that
-rotor, which has less thrust or whose tachometer is wrong: that is not told apart. Thrust alone is the model's or the accelerometer's until
-the bank of `haltere.diagnosis.inertial` is silent with power. A force across the thrust axis is {model, wind} where the air was still,
-and nobody's in wind; both of them are wind, and no fault.
+rotor, which has less thrust or whose tachometer is wrong: that is not told apart; from then on the model has it so. A force is tried
+against a change of the wind (`haltere.diagnosis.wind_or_force`), and is the model's or the accelerometer's until the bank of
+`haltere.diagnosis.inertial` is silent with power. What gusts may do convicts nobody. A compass that turns while the gyro agrees with the
+rotors is a disturbed compass.
 """
 
 from __future__ import annotations
@@ -13,13 +14,18 @@ import math
 from typing import Any
 
 from haltere._jit import constant, jit
-from haltere.aids.air import wind_n
+from haltere.aids import compass
+from haltere.aids.compass import OUT_TURN
 from haltere.aids.record import E_FAULT, E_OVER, E_SUSPECT, NO_SENSOR, event_since
-from haltere.diagnosis.pairs import calm_again, change
-from haltere.diagnosis.stand_in import density_of_noise, offset_variance
-from haltere.filter.signatures import ACCEL, SLOTS
+from haltere.diagnosis import doubt
+from haltere.diagnosis.pairs import BLOCK, CALM_ENOUGH, calm_again, change, listen, shift_bias, would_show
+from haltere.diagnosis.rate_step import began, shape
+from haltere.diagnosis.stand_in import density_of_noise, mark_before, offset_variance
+from haltere.diagnosis.wind_or_force import WIND, best, follow, start
+from haltere.filter.signatures import ACCEL, SLOTS, clear
+from haltere.strapdown.propagate import gusts, inject
 
-__all__ = ["CANDIDATES", "MODEL", "ROTOR", "judge"]
+__all__ = ["CANDIDATES", "MODEL", "ROTOR", "hear"]
 
 #: Codes of an event, above those of `haltere.diagnosis.steps`: six axes of the model, then rotors.
 MODEL, ROTOR = constant(64), constant(70)
@@ -29,26 +35,113 @@ MOST = 8
 CANDIDATES = (
     "model.hx", "model.hy", "model.t", "model.r", "model.p", "model.q", "wind", "accel.x", "accel.y", "accel.z",
     "gyro.x", "gyro.y", "gyro.z",
-    *(f"rotor.{k}" for k in range(MOST)), *(f"rotors.{k}" for k in range(MOST)),
+    *(f"rotor.{k}" for k in range(MOST)), *(f"rotors.{k}" for k in range(MOST)), "magnetometer",
 )  # fmt: skip
-B_WIND, B_ACCEL, B_GYRO, B_ROTOR, B_TACHOMETER = (constant(i) for i in (6, 7, 10, 13, 21))
-#: When a change is looked at first, and when a verdict on moments is given [s]; how long one on forces may wait.
-EARLY, COLLECT, WAIT = 0.08, 0.3, 2.5
-#: A change of rate that has grown by less than this factor from one to the other is a step.
-STEPPED = 1.6
+B_WIND, B_ACCEL, B_GYRO, B_ROTOR, B_TACHOMETER, B_COMPASS = (constant(i) for i in (6, 7, 10, 13, 21, 29))
+#: When a change is looked at first, and when a verdict on moments is given [s]; how long one on forces may wait, and one on a rotor.
+EARLY, COLLECT, WAIT, LONGER = 0.08, 0.3, 6.0, 2.0
+#: How long a force and wind are compared at the most before both are named [s].
+COMPARED = 2.5
 #: By how much a hypothesis must explain better, in twice the log likelihood; what a signature is off by itself, and least 1 sigma.
-MARGIN, LIKE, LEAST_M, LEAST_F = 9.0, 0.2, 0.15, 0.08
+MARGIN, LIKE, LEAST_M, LEAST_F = 9.0, 0.2, 0.15, 0.04
+#: Two rotors that explain alike within the first are both named, within the second they are looked at for longer.
+NEARLY, UNLIKE = 1.0, 3.0
+#: A moment that has lasted for so long [s] before its alarm is dated anew.
+OLD = 0.5
 #: Least change of a rotor's thrust that is a fault.
-LEAST_ROTOR = 0.03
-#: Air that is still: wind and gusts below these [m/s].
-STILL = 1.5
-#: Drag that a wind as large as a force would have [1/s]; what the other axis may show of a force along one; in the air before [s].
-TYPICAL_DRAG, BESIDE, STILL_FOR = 0.3, 0.3, 3.0
-#: Statistics of the bank for silence with power: 99 %.
-POWER = 2.33
+LEAST_ROTOR = 0.015
+#: 1 sigma of what a rotor that has lost thrust has lost of its torque, beside that.
+TORQUE = 0.1
+#: Air that is still: the wind is below this [m/s]; in the air before [s]; how many sigma of gusts a force must exceed.
+STILL, STILL_FOR, BEYOND_GUSTS = 1.5, 3.0, 4.0
+#: Vertical gusts beside horizontal ones; drag by wind that an unknown one may have [1/s].
+DOWN, TYPICAL_DRAG = 0.5, 0.3
+#: Statistics of the bank for silence with power: 99 %; and what must speak against a fault of the size, in twice the log likelihood.
+POWER, AGAINST = 2.33, 16.0
 #: A fault is over when the change is its reverse within this part.
 REVERSE = 0.4
+#: A step of the gyro and the onset of what turned the compass are one if so near [s]; part of a step that its size may be off by.
+AROUND_OUT, UNSURE = 5.0, 0.2
+#: For how long what was done about one fault may turn the compass [s].
+HEALS = 10.0
+#: How much earlier than the window of an alarm a step may be [s]; what a force of the air off the centre turns [rad/s^2 per m/s^2].
+AROUND, OFF_CENTRE = 0.1, 0.6
+#: Gusts push so many sigma of theirs; a finding below this part of a rotor's fault that is carried is its change.
+AS_GUSTS, PART = 1.5, 0.6
+#: What the model of a moment is off by as a part of the largest of late: constants, and the time of a rotor's speed.
+HARD = 0.05
 UP, FORCES, T, R, P, Q = (constant(i) for i in (1, 3, 2, 3, 4, 5))
+
+
+@jit
+def hear(s: Any, prm: Any) -> None:
+    """Take the block that has ended: detectors, the trial of a force, a pending alarm, the compass."""
+    p = s.pairs[0]
+    dt = p.span
+    pending = listen(s, prm)
+    if pending:
+        if p.trial == 1:
+            follow(s, dt)
+        judge(s, prm)
+    if len(s.bank) > 0 and s.bank[0].healed != p.healed_out:
+        p.healed_out, p.t_healed = s.bank[0].healed, s.t
+    if s.compass.out != p.out:
+        p.out = s.compass.out
+        if p.out == OUT_TURN:
+            compass_or_gyro(s, prm)
+
+
+@jit
+def compass_or_gyro(s: Any, prm: Any) -> None:
+    """The compass turned against the gyro and was put out: which of them it was, if the rotors say."""
+    p, c = s.pairs[0], s.compass
+    if s.t < p.t_healed + HEALS:
+        return  # what was done about another fault has turned it
+    if p.t_step[2] > c.onset - AROUND_OUT and p.on[2] == 0:
+        name_gyro(s, 2)
+        return
+    if p.t_hint[Q] > c.onset - AROUND_OUT or p.on[2] == 1 or p.t_calm > c.onset - 0.5:
+        return  # the rotors do not agree with the gyro either
+    rate = c.jump / max(s.t - c.onset, 0.1)
+    if would_show(s, prm, Q, rate):
+        n = s.n_events
+        event_since(s, s.t, c.onset, E_SUSPECT, NO_SENSOR, math.nan, math.nan, MODEL + Q)
+        if s.n_events > n:
+            s.event[n].seen, s.event[n].size, s.event[n].sd, s.event[n].candidates = s.t, rate, 0.0, UP << B_COMPASS
+
+
+@jit
+def name_gyro(s: Any, a: int) -> None:
+    """A gyro axis stepped against the rotors: say so, and take back what it did."""
+    p = s.pairs[0]
+    size, since = p.step[a], s.t - p.t_step[a]
+    n = s.n_events
+    event_since(s, s.t, p.t_step[a], E_FAULT, NO_SENSOR, math.nan, math.nan, MODEL + R + a)
+    sd2 = moment_spread(s, R + a) + UNSURE * UNSURE * size * size
+    if s.n_events > n:
+        e = s.event[n]
+        e.seen, e.size, e.sd, e.candidates = min(p.t_hint[R + a], s.t), size, math.sqrt(sd2), UP << (B_GYRO + a)
+    s.dx[a], s.dx[9 + a] = -size * since, size
+    s.P[9 + a, 9 + a] += sd2
+    s.P[a, a] += sd2 * since * since
+    s.P[a, 9 + a] -= sd2 * since
+    s.P[9 + a, a] -= sd2 * since
+    inject(s)
+    shift_bias(s, R + a, size)
+    p.next[R + a] += size
+    if len(s.bank) > 0:
+        clear(s.bank[0])
+        s.bank[0].healed += 1
+        s.bank[0].yaw = s.yaw_corrected
+    compass.forget(s)
+    p.out, p.t_step[a] = s.compass.out, -1e9
+    settle(s)
+
+
+@jit
+def moment_spread(s: Any, i: int) -> float:
+    """Variance of a change of rate over a block or two of time to look [rad^2/s^2]."""
+    return float(2.0 * s.pairs[0].r[i] + density_of_noise(s, i) * COLLECT + offset_variance(s, i) * COLLECT * COLLECT)
 
 
 @jit
@@ -58,27 +151,25 @@ def judge(s: Any, prm: Any) -> None:
     since = s.t - p.t_first
     if len(s.bank) > 0 and s.bank[0].healed != p.healed:  # an inertial fault was named meanwhile: it explains this
         settle(s)
+        p.t_across = s.t
         return
-    if s.t - p.onset >= EARLY and p.early[5] != p.early[5]:
-        for i in range(6):
-            p.early[i] = change(s, i)
     if since < COLLECT:
         return
-    if p.mark < 0:
+    if p.mark < 0 or (len(s.bank) > 0 and doubt.near_ground(s)):
         settle(s)
         return
-    moments = False
+    moments, late = False, False
     for i in range(R, 6):  # later ones are what the vehicle makes of the first
         if p.t_alarm[i] > p.t_first + COLLECT:
-            p.t_alarm[i] = 0.0
+            p.t_alarm[i], late = 0.0, True
         moments = moments or p.t_alarm[i] != 0.0
     if moments:
-        of_moments(s, prm)
-        settle(s)
-    elif p.t_alarm[0] != 0.0 or p.t_alarm[1] != 0.0:
-        across(s, prm, since)
-    elif p.t_alarm[T] != 0.0:
-        of_thrust(s, prm, since)
+        if of_moments(s, prm) or since > LONGER:
+            settle(s)
+    elif late:  # a force was looked at, and there is something new: it alarms again by itself
+        settle_forces(s)
+    elif p.t_alarm[0] != 0.0 or p.t_alarm[1] != 0.0 or p.t_alarm[T] != 0.0:
+        of_forces(s, prm, since)
     else:
         settle(s)
 
@@ -87,10 +178,22 @@ def judge(s: Any, prm: Any) -> None:
 def settle(s: Any) -> None:
     """End an alarm; levels as they are now are what is usual from here on."""
     p = s.pairs[0]
-    p.t_first = 0.0
+    p.t_first, p.trial, p.n_blocks, p.t_calm = 0.0, 0, 0, s.t
     for i in range(6):
         calm_again(s, i)
-        p.early[i], p.told_size[i] = math.nan, 0.0
+        p.told_size[i] = 0.0
+    p.still = 0
+
+
+@jit
+def settle_forces(s: Any) -> None:
+    """The same of forces alone: rates are listened to as before."""
+    p = s.pairs[0]
+    p.t_first, p.trial, p.t_across = 0.0, 0, s.t
+    for i in range(6):
+        if i < FORCES:
+            calm_again(s, i)
+        p.t_alarm[i], p.told_size[i] = 0.0, 0.0
     p.still = 0
 
 
@@ -130,9 +233,11 @@ def conclude(s: Any, k: int, detail: Any, size: float, sd: float, candidates: in
         p.wrong &= ~(UP << k)
         tell(s, E_OVER, detail, size, sd, candidates)
         return
+    known = (p.wrong >> k) & 1 == 1 and k >= 6  # a rotor's fault that is carried was not quite that large
     p.wrong |= UP << k
-    p.was[k] = size
-    tell(s, code, detail, size, sd, candidates)
+    p.was[k] = size + (p.was[k] if known else 0.0)
+    if not known or abs(size) > 0.5 * abs(p.was[k]):
+        tell(s, code, detail, p.was[k], sd, candidates)
 
 
 @jit
@@ -144,18 +249,44 @@ def signature(s: Any, k: int) -> tuple[float, float, float]:
 
 
 @jit
-def of_moments(s: Any, prm: Any) -> None:
-    """A gyro axis, a moment of the model, or a rotor."""
+def lift(s: Any, k: int, thrust: float, m_q: float, s_q: float) -> None:
+    """Let the model have a rotor's thrust as it was found, and its torque: as much, or what the yawing moment says."""
+    p, m = s.pairs[0], s.model[0]
+    g = m.k[5, 0] * m.yaw[k] * s.speed[k] * s.speed[k] * p.ratio
+    gain = TORQUE * TORQUE * g / (TORQUE * TORQUE * g * g + s_q * s_q)
+    over = (p.wrong >> (6 + k)) & 1 == 0
+    p.lift[k] = 0.0 if over else p.lift[k] + thrust
+    p.torque[k] = 0.0 if over else p.torque[k] + thrust + gain * (m_q - g * thrust)
+    p.lifted = 1
+
+
+@jit
+def of_moments(s: Any, prm: Any) -> bool:
+    """A gyro axis, a moment of the model, or a rotor; False where it is not clear yet which rotor."""
     p = s.pairs[0]
+    if p.t_first - p.onset > OLD:  # a long window was full already: it says nothing of when
+        for i in range(R, 6):
+            if p.t_alarm[i] == p.t_first:
+                p.onset = began(p, i - R, p.m_drift[p.mark, i])
+                p.mark = max(mark_before(p, p.onset - 2.0 * BLOCK), 0)
     m_r, s_r = moment_of(s, R)
     m_p, s_p = moment_of(s, P)
     m_q, s_q = moment_of(s, Q)
-    f, s_f = change(s, T), math.sqrt(offset_variance(s, T) + LEAST_F * LEAST_F)
+    span = max(s.t - p.onset, EARLY)
+    lasting = density_of_noise(s, T) * min(1.0, p.scale[T]) + p.r[T] * BLOCK
+    f, s_f = change(s, T), math.sqrt(lasting / span + LEAST_F * LEAST_F)
+    alarmed = (p.t_alarm[R] != 0.0) + (p.t_alarm[P] != 0.0) + (p.t_alarm[Q] != 0.0)
     for i in range(R, 6):  # a rate that steps and stays, and the other axes keep quiet
-        others = (p.t_alarm[R] != 0.0) + (p.t_alarm[P] != 0.0) + (p.t_alarm[Q] != 0.0) - 1
-        if p.t_alarm[i] != 0.0 and others == 0 and abs(change(s, i)) < STEPPED * abs(p.early[i]):
-            return  # the gyro's: steps and bank say so
-    best, least, lift = -1, 1e18, 0.0
+        if p.t_alarm[i] != 0.0 and alarmed == 1:
+            better, step, onset = shape(p, i - R, p.m_drift[p.mark, i], p.onset - AROUND)
+            if better > -MARGIN:
+                p.t_step[i - R], p.step[i - R] = onset, step
+            if better > MARGIN and abs(step) > prm.diagnosis_gyro and p.calm <= CALM_ENOUGH:
+                name_gyro(s, i - R)
+                return True
+            if better > -MARGIN:
+                return True  # it may be the gyro's: the bank will say so
+    first, other, least, second, thrust = -1, -1, 1e18, 1e18, 0.0
     for k in range(min(len(s.speed), MOST)):
         g = signature(s, k)
         weight = (1.0 / (s_r * s_r), 1.0 / (s_p * s_p), 1.0 / (s_f * s_f))
@@ -165,7 +296,9 @@ def of_moments(s: Any, prm: Any) -> None:
         d = (g[0] * m_r * weight[0] + g[1] * m_p * weight[1] + g[2] * f * weight[2]) / den
         left = misfit(m_r, d * g[0], s_r) + misfit(m_p, d * g[1], s_p) + misfit(f, d * g[2], s_f)
         if left < least:
-            best, least, lift = k, left, d
+            first, other, least, second, thrust = k, first, left, least, d
+        elif left < second:
+            other, second = k, left
     nothing = (m_r / s_r) * (m_r / s_r) + (m_p / s_p) * (m_p / s_p) + (f / s_f) * (f / s_f)
     alone = (nothing - (m_r / s_r) * (m_r / s_r), nothing - (m_p / s_p) * (m_p / s_p), nothing)
     spread = (m_q / s_q) * (m_q / s_q)
@@ -176,12 +309,40 @@ def of_moments(s: Any, prm: Any) -> None:
         axis, single = P, alone[1] + spread
     if p.t_alarm[Q] == 0.0 and axis == Q:
         axis, single = (R, alone[0]) if abs(m_r / s_r) > abs(m_p / s_p) else (P, alone[1])
-    if best >= 0 and least + MARGIN < single and abs(lift) > LEAST_ROTOR:
-        conclude(s, 6 + best, ROTOR + best, lift, 0.02, (UP << (B_ROTOR + best)) | (UP << (B_TACHOMETER + best)), E_FAULT)
-        return
+    pushed = AS_GUSTS * (by_gusts(s, prm, 0) + by_gusts(s, prm, 1))
+    pushed += (abs(p.told_size[0]) if p.t_alarm[0] != 0.0 else 0.0) + (abs(p.told_size[1]) if p.t_alarm[1] != 0.0 else 0.0)
+    least_moment = prm.diagnosis_moment + OFF_CENTRE * pushed + HARD * p.hard
+    carried = -1
+    for k in range(min(len(s.speed), MOST)):
+        if (p.wrong >> (6 + k)) & 1 == 1:
+            carried = k
+    if carried >= 0 and p.lifted == 1:  # its thrust is not what was found by so much, or goes with speed in another way
+        g = signature(s, carried)
+        small = abs(m_r) < PART * abs(p.lift[carried] * g[0]) and abs(m_p) < PART * abs(p.lift[carried] * g[1])
+        if small and (first != carried or abs(thrust) < PART * abs(p.lift[carried])):
+            weight = (1.0 / (s_r * s_r), 1.0 / (s_p * s_p), 1.0 / (s_f * s_f))
+            den = g[0] * g[0] * weight[0] + g[1] * g[1] * weight[1] + g[2] * g[2] * weight[2]
+            lift(s, carried, (g[0] * m_r * weight[0] + g[1] * m_p * weight[1] + g[2] * f * weight[2]) / den, m_q, s_q)
+            return True
+    turns = 0.0
+    if first >= 0:
+        g = signature(s, first)
+        turns = abs(thrust) * math.sqrt(g[0] * g[0] + g[1] * g[1])
+    if first >= 0 and least + MARGIN < single and abs(thrust) > LEAST_ROTOR and turns > least_moment:
+        if second - least < UNLIKE and s.t - p.t_first < LONGER:
+            return False
+        if second - least < NEARLY:
+            both = (UP << (B_ROTOR + first)) | (UP << (B_ROTOR + other)) | (UP << (B_TACHOMETER + first)) | (UP << (B_TACHOMETER + other))
+            tell(s, E_SUSPECT, ROTOR + first, thrust, 0.02, both)
+            return True
+        bits = (UP << (B_ROTOR + first)) | (UP << (B_TACHOMETER + first))
+        conclude(s, 6 + first, ROTOR + first, thrust, 0.02, bits, E_FAULT)
+        lift(s, first, thrust, m_q, s_q)
+        return True
     size, sd = (m_r, s_r) if axis == R else ((m_p, s_p) if axis == P else (m_q, s_q))
-    if abs(size) > prm.diagnosis_moment:
+    if abs(size) > least_moment:
         conclude(s, axis, MODEL + axis, size, sd, UP << axis, E_FAULT)
+    return True
 
 
 @jit
@@ -197,62 +358,76 @@ def silent(s: Any, prm: Any, a: int, size: float) -> int:
     if len(s.bank) == 0:
         return 0
     b = s.bank[0]
-    best, near = -1, 1e18
+    slot, near = -1, 1e18
     for k in range(len(b.live)):
         if b.live[k] == 1 and abs(b.onset[k] - p.onset) < near:
-            best, near = k, abs(b.onset[k] - p.onset)
-    if best < 0 or near > 0.5:
+            slot, near = k, abs(b.onset[k] - p.onset)
+    if slot < 0 or near > 0.5:
         return 0
-    j = (ACCEL + a) * SLOTS + best
+    j = (ACCEL + a) * SLOTS + slot
     h = prm.diagnosis_threshold
     level = b.num[j] * b.num[j] / max(b.den[j], 1e-9)
     root = math.sqrt(h) + POWER
     if level > h:
         return -1
-    return 1 if size * size * b.den[j] >= root * root else 0
+    gain = 2.0 * size * b.num[j] - size * size * b.den[j]
+    return 1 if size * size * b.den[j] >= root * root and gain < -AGAINST else 0
 
 
 @jit
-def of_thrust(s: Any, prm: Any, since: float) -> None:
-    """Force along the thrust axis: the model's, or the accelerometer's."""
+def by_gusts(s: Any, prm: Any, a: int) -> float:
+    """1 sigma of the force along an axis that gusts like those of late make [m/s^2]."""
     p = s.pairs[0]
-    size = change(s, T)
-    if abs(size) < 0.5 * abs(p.told_size[T]) and abs(size) < prm.diagnosis_force:  # gone by itself
-        settle(s)
-        return
-    quiet = silent(s, prm, T, size)
-    if quiet == 1:
-        conclude(s, T, MODEL + T, size, 0.05, UP << T, E_FAULT)
-        settle(s)
-    elif since > WAIT and quiet == 0:
-        conclude(s, T, MODEL + T, size, 0.05, (UP << T) | (UP << (B_ACCEL + 2)), E_SUSPECT)
-        settle(s)
-    elif since > 2.0 * WAIT:
-        settle(s)
+    gust = prm.air_gust
+    if len(s.wind) > 0:
+        gust, _ = gusts(s, prm)
+        if len(s.drag) > 0:
+            gust /= max(math.exp(s.drag[0]), 1e-3)
+    gust *= p.calm
+    x, y, z = p.by_v[0, a, 0], p.by_v[0, a, 1], DOWN * p.by_v[0, a, 2]
+    return gust * math.sqrt(x * x + y * y + z * z)
 
 
 @jit
-def across(s: Any, prm: Any, since: float) -> None:
-    """Forces across the thrust axis: wind, or in still air the model's or the accelerometer's."""
+def of_forces(s: Any, prm: Any, since: float) -> None:
+    """Forces: wind, or the model's or the accelerometer's."""
     p = s.pairs[0]
-    p.t_across = s.t
-    first, second = abs(p.told_size[0]), abs(p.told_size[1])
-    a = 0 if first > second else 1
-    size = p.told_size[a]
     if p.still == 0:  # looked at once, soon after the alarm: later the filter's wind has followed
-        W = wind_n(s)
-        moved = size / TYPICAL_DRAG
-        still = W[0] * W[0] + W[1] * W[1] < STILL * STILL + moved * moved and p.t_flying < p.onset - STILL_FOR
-        p.still = 1 if still and min(first, second) < BESIDE * max(first, second) else -1
+        W, a = (p.m_wind[p.mark, 0], p.m_wind[p.mark, 1]), 0
+        for i in range(FORCES):
+            a = i if abs(p.told_size[i]) > abs(p.told_size[a]) else a
+        still = W[0] * W[0] + W[1] * W[1] < STILL * STILL and p.t_flying < p.onset - STILL_FOR
+        p.still = 1 if still and abs(p.told_size[a]) > by_gusts(s, prm, a) else -1
+        if p.still == 1:
+            start(s)
+            return
     if p.still < 0:  # wind, whatever else
-        settle(s)
+        settle_forces(s)
+        return
+    a = best(s)
+    gap = p.misfit[WIND] - p.misfit[a]
+    others = 1e18
+    for i in range(FORCES):
+        if i != a:
+            others = min(others, p.misfit[i] - p.misfit[a])
+    if gap < -MARGIN or (gap < 0.0 and since > COMPARED):
+        settle_forces(s)
+        return
+    size = p.push[a]
+    if since > 1.0 and abs(size) < max(0.5 * prm.diagnosis_force, BEYOND_GUSTS * by_gusts(s, prm, a)):  # gusts, or gone by itself
+        settle_forces(s)
+        return
+    if len(s.bank) > 0 and s.bank[0].alarm != 0 and since < WAIT:  # an inertial fault is about to be named
         return
     quiet = silent(s, prm, a, size)
-    if quiet == 1:
-        conclude(s, a, MODEL + a, size, 0.05, (UP << a) | (UP << B_WIND), E_SUSPECT)
-        settle(s)
-    elif since > WAIT and quiet == 0:
-        conclude(s, a, MODEL + a, size, 0.05, (UP << a) | (UP << (B_ACCEL + a)), E_SUSPECT)
-        settle(s)
-    elif since > 2.0 * WAIT:
-        settle(s)
+    windy = gap < MARGIN or len(s.wind) == 0
+    if (windy and since < COMPARED) or (others < MARGIN and since < COMPARED):
+        return
+    if quiet == 1 and abs(size) > BEYOND_GUSTS * by_gusts(s, prm, a):
+        candidates = (UP << a) | ((UP << B_WIND) if windy else 0)
+        conclude(s, a, MODEL + a, size, 0.05, candidates, E_SUSPECT if windy else E_FAULT)
+        settle_forces(s)
+    elif since > WAIT:
+        if quiet == 0 and not windy:  # three that it may be are no verdict
+            conclude(s, a, MODEL + a, size, 0.05, (UP << a) | (UP << (B_ACCEL + a)), E_SUSPECT)
+        settle_forces(s)

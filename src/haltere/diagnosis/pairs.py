@@ -13,32 +13,64 @@ import math
 from typing import Any
 
 from haltere._jit import constant, jit
-from haltere.core.rotation import Vec
+from haltere.aids.air import wind_n
+from haltere.core.rotation import Vec, dcm, tmat_vec
 from haltere.diagnosis.stand_in import across, density_of_noise, mark_before, offset_variance
 from haltere.filter.windows import empty, take
-from haltere.strapdown.pairs import MARKS
+from haltere.strapdown.pairs import LATELY, MARKS
 from haltere.strapdown.propagate import gusts
 
-__all__ = ["BLOCK", "calm_again", "change", "gather", "listen", "restart"]
+__all__ = [
+    "BLOCK",
+    "CALM_ENOUGH",
+    "calm_again",
+    "change",
+    "contradicted",
+    "gather",
+    "hinted",
+    "listen",
+    "restart",
+    "shift_bias",
+    "vouch",
+    "would_show",
+]
 
 #: A block, and time between marks of the past [s].
 BLOCK, MARK = 0.01, 0.25
 #: Biases are held for so long [s]; blocks until a chain is known; time in the air before [s].
 HELD, WARM, AIRBORNE = 5.0, 200, 2.0
 #: An offset walks by its 1 sigma in this time [s]; 1 sigma of one that begins anew, in those.
-WALK, ANEW = 5.0, 10.0
+WALK, ANEW, ANEW_MOMENT = 5.0, 10.0, 30.0
 #: Memory of what innovations come to, and of the noise of a block, in blocks; how far a lone one may move it.
 LEARN, NOISE, LONE = 2000.0, 500.0, 9.0
+#: And the shortest of the first, at the beginning.
+EARLY_LEARN = 100.0
+#: How fast the noise of a chain follows the flight, a part a block, at first and later; its bounds, over the vehicle file's.
+QUICK, SETTLED, LEAST_SCALE, MOST_SCALE = 0.2, 0.02, 0.01, 4.0
 #: Most correlation of neighbours that is taken out.
 MOST_RHO = 0.9
 #: As in `haltere.diagnosis.inertial`: over how many usual ones a threshold is, stretch [s], how fast that is learnt, its bound.
 BEYOND_USUAL, STRETCH, RISE, FALL, CAP = 2.0, 10.0, 0.6, 0.1, 2.0
+#: What is left of the largest moment of late, a block.
+HARD_FOR = 0.98
+#: Forces are compared in the wind of so long ago [s].
+LAG = 1.0
 #: Memory of gusts [s].
 STIR = 20.0
 #: A wind that changed, or was taken for one, is found again and again for so long [s]: forces are not judged meanwhile.
-FOLLOWS = 15.0
+FOLLOWS = 5.0
 #: Least part of the gusts expected that are taken for there.
 CALMEST = 0.2
+#: And the most of them with which forces are held against an accelerometer.
+CALM_ENOUGH = 0.4
+#: Of a step's squares, the part that the windows find; sigmas for a power of 99 %.
+FOUND, POWER = 0.6, 2.33
+#: An onset of the bank of signatures is on a grid of so many seconds; an alarm of the pair is that of a fault if it came so long after.
+GRID, HINTED = 0.25, 1.0
+#: And a fault that it would show must have shown within this time.
+SHOWS = 0.5
+#: Rotors and gyro agree if no detector of theirs alarmed for so long [s].
+AGREED = 5.0
 FORCES, AXES = constant(3), constant(6)
 
 
@@ -46,10 +78,24 @@ FORCES, AXES = constant(3), constant(6)
 def calm_again(s: Any, i: int) -> None:
     """Begin the chain of a pair anew: whatever its offset is now is what it is compared with."""
     p = s.pairs[0]
-    v = offset_variance(s, i) * ANEW * ANEW
+    v = offset_variance(s, i) * (ANEW * ANEW if i < FORCES else ANEW_MOMENT * ANEW_MOMENT)
     p.P[i, 0], p.P[i, 1], p.P[i, 2] = v if i < FORCES else 1.0, 0.0, v
-    p.z[i], p.t_alarm[i], p.n_blocks = 0.0, 0.0, 0
+    p.z[i], p.t_alarm[i] = 0.0, 0.0
     empty(p.w[i])
+
+
+@jit
+def shift_bias(s: Any, i: int, change: float) -> None:
+    """Let residuals of a pair be free of a bias that is larger by ``change``; levels are those of the biases in use."""
+    p = s.pairs[0]
+    p.bias[i] += change
+    p.level[i] -= change
+    p.before[i] -= change
+    for k in range(MARKS):
+        p.m_level[k, i] -= change
+    if i >= FORCES:
+        for k in range(LATELY):
+            p.lately[k, i - FORCES] -= change
 
 
 @jit
@@ -80,12 +126,7 @@ def use_bias(s: Any) -> None:
         new = s.ba[i] if i < FORCES else s.bg[i - 3]
         used = new if begins else p.next[i]
         p.next[i] = new
-        shift = used - p.bias[i]
-        p.bias[i] = used
-        p.level[i] -= shift
-        p.before[i] -= shift
-        for k in range(MARKS):
-            p.m_level[k, i] -= shift
+        shift_bias(s, i, used - p.bias[i])
 
 
 @jit
@@ -93,19 +134,25 @@ def restart(s: Any) -> None:
     """Forget chains and alarms: on the ground, without rotor speeds, after alignment."""
     p = s.pairs[0]
     p.t_across = -1e9
-    p.n, p.span, p.t_first, p.t_bias, p.stir, p.calm = 0.0, 0.0, 0.0, -1e9, 1.0, 1.0
+    p.n, p.span, p.t_first, p.t_bias, p.stir, p.calm, p.n_stir, p.n_blocks, p.trial = 0.0, 0.0, 0.0, -1e9, 1.0, 1.0, 0.0, 0, 0
+    p.hard = 0.0
+    p.out, p.t_healed = s.compass.out, -1e9
+    p.healed_out = s.bank[0].healed if len(s.bank) > 0 else 0
     for i in range(6):
-        p.sum[i], p.drift[i], p.level[i], p.early[i], p.told_size[i] = 0.0, 0.0, 0.0, math.nan, 0.0
+        p.sum[i], p.drift[i], p.level[i], p.told_size[i], p.t_hint[i] = 0.0, 0.0, 0.0, 0.0, -1e9
         calm_again(s, i)
+    for i in range(3):
+        p.t_step[i] = -1e9
+    p.n_lately, p.lag = 0, -1
     for k in range(MARKS):
         p.m_t[k] = -1e9
 
 
 @jit
 def chain(s: Any, i: int, y: float, dt: float) -> float:
-    """Take a block's residual into the chain of a pair; the innovation in its own sigma."""
+    """Take a block's residual into the chain of a pair; the innovation."""
     p = s.pairs[0]
-    q = offset_variance(s, i) / WALK * dt
+    q = offset_variance(s, i) / WALK * dt * p.scale[i]
     if i < FORCES:
         p.P[i, 0] += q
         S = p.P[i, 0] + p.r[i]
@@ -115,7 +162,7 @@ def chain(s: Any, i: int, y: float, dt: float) -> float:
         p.P[i, 0] *= 1.0 - k
     else:
         p.level[i] += dt * p.drift[i]
-        p.P[i, 0] += dt * (2.0 * p.P[i, 1] + dt * p.P[i, 2]) + density_of_noise(s, i) * dt
+        p.P[i, 0] += dt * (2.0 * p.P[i, 1] + dt * p.P[i, 2]) + density_of_noise(s, i) * dt * p.scale[i]
         p.P[i, 1] += dt * p.P[i, 2]
         p.P[i, 2] += q
         S = p.P[i, 0] + p.r[i]
@@ -127,14 +174,14 @@ def chain(s: Any, i: int, y: float, dt: float) -> float:
         p.P[i, 1] *= 1.0 - k
         p.P[i, 0] *= 1.0 - k
     p.sd[i] = math.sqrt(S)
-    return e / p.sd[i]
+    return e
 
 
 @jit
 def size_of(p: Any, i: int, rho: float, dt: float) -> float:
     """Size of what is in the window that says most: a force, or a moment from the innovations it makes in a settled chain."""
     w = p.w[i]
-    e = w.mean[0] * math.sqrt((1.0 + rho) / (1.0 - rho) * p.c0[i]) * p.sd[i]
+    e = w.mean[0] * math.sqrt((1.0 + rho) / (1.0 - rho) * p.c0[i])
     return e if i < FORCES else e * p.P[i, 0] / p.r[i] / dt  # a settled chain follows with its gain, P/r, of the innovation a block
 
 
@@ -147,15 +194,18 @@ def listen(s: Any, prm: Any) -> bool:
     first = p.n_blocks == 0
     p.n_blocks += 1
     learns = p.t_first == 0.0
+    blown = by_lag(s)
     for i in range(AXES):
         y = p.sum[i] / n
-        p.sum[i] = 0.0
+        p.sum[i], p.residual[i] = 0.0, y
+        if i < FORCES:
+            y += p.by_v[0, i, 0] * blown[0] + p.by_v[0, i, 1] * blown[1] + p.by_v[0, i, 2] * blown[2]
         if first:
             p.level[i] = y
             p.before[i] = y
             if p.r[i] <= 0.0:
                 p.r[i] = 1e-3 if i >= FORCES else 0.3
-                p.c0[i], p.c1[i] = 1.0, 0.0
+                p.c0[i], p.c1[i], p.scale[i], p.n_learnt[i] = 2.0 * p.r[i], 0.0, 1.0, 0.0
             continue
         d = y - p.before[i]
         p.before[i] = y
@@ -164,9 +214,14 @@ def listen(s: Any, prm: Any) -> bool:
         if p.n_blocks < WARM // 2:
             continue
         if learns:
-            a = min(z * z, LONE * p.c0[i])
-            p.c0[i] += (a - p.c0[i]) / LEARN
-            p.c1[i] += (min(max(z * p.z[i], -LONE * p.c0[i]), LONE * p.c0[i]) - p.c1[i]) / LEARN
+            p.n_learnt[i] = min(p.n_learnt[i] + 1.0, LEARN)
+            rate = 1.0 / max(p.n_learnt[i], EARLY_LEARN)
+            x = min(max(z * p.z[i], -LONE * p.c0[i]), LONE * p.c0[i])
+            p.c0[i] += rate * (min(z * z, LONE * p.c0[i]) - p.c0[i])
+            p.c1[i] += rate * (x - p.c1[i])
+            # neighbours that are alike: the chain is too slow for what the model leaves; that alternate: too quick
+            quick = min(QUICK, max(SETTLED, EARLY_LEARN * rate * QUICK))
+            p.scale[i] = min(max(p.scale[i] * (1.0 + quick * x / p.c0[i]), LEAST_SCALE), 1.0 if i < FORCES else MOST_SCALE)
         p.z[i] = z
         rho = min(max(p.c1[i] / p.c0[i], 0.0), MOST_RHO)
         glr = take(p.w[i], (z / math.sqrt(p.c0[i]), 0.0, 0.0), 1, rho)
@@ -180,12 +235,20 @@ def listen(s: Any, prm: Any) -> bool:
         if over > factor and p.t_alarm[i] == 0.0:
             size = size_of(p, i, rho, dt)
             if abs(size) > (prm.diagnosis_force if i < FORCES else prm.diagnosis_moment):
-                p.t_alarm[i], p.told_size[i] = s.t, size
+                p.t_alarm[i], p.told_size[i], p.t_hint[i] = s.t, size, s.t
                 if p.t_first == 0.0:
                     p.t_first, p.onset = s.t, s.t - p.w[i].window * BLOCK
                     p.statistic, p.threshold = glr, factor * prm.diagnosis_pair_threshold
                     p.mark = mark_before(p, p.onset - 2.0 * BLOCK)
                     p.healed = s.bank[0].healed if len(s.bank) > 0 else 0
+    p.hard *= HARD_FOR
+    for i in range(FORCES):
+        p.hard = max(p.hard, abs(p.m[i]))
+    k = p.n_lately % LATELY
+    for i in range(FORCES):
+        p.lately[k, i] = p.residual[FORCES + i]
+    p.t_lately[k] = s.t
+    p.n_lately += 1
     if s.t >= p.t_usual:
         p.t_usual = s.t + STRETCH
         for i in range(AXES):
@@ -195,6 +258,16 @@ def listen(s: Any, prm: Any) -> bool:
     if s.t >= p.t_mark and p.t_first == 0.0 and p.n_blocks > WARM // 2:
         remember(s, prm)
     return p.t_first != 0.0
+
+
+@jit
+def by_lag(s: Any) -> Vec:
+    """Wind of a while ago less that of now, body frame [m/s]: an estimate that follows at once would hide a change of force."""
+    p = s.pairs[0]
+    if p.lag < 0:
+        return (0.0, 0.0, 0.0)
+    W = wind_n(s)
+    return tmat_vec(dcm((s.q[0], s.q[1], s.q[2], s.q[3])), (p.m_wind[p.lag, 0] - W[0], p.m_wind[p.lag, 1] - W[1], 0.0))
 
 
 @jit
@@ -209,12 +282,16 @@ def remember(s: Any, prm: Any) -> None:
         p.m_level[k, i], p.m_drift[k, i], p.m_var[k, i] = p.level[i], p.drift[i], p.P[i, 0]
     for i in range(3):
         p.m_turn[k, i] = p.turn[i]
+    W = wind_n(s)
+    p.m_wind[k, 0], p.m_wind[k, 1] = W[0], W[1]
+    p.lag = mark_before(p, s.t - LAG)
     if len(s.wind) > 0 and not across(s):
         gust, _ = gusts(s, prm)
         blown = 0.0
         for i in range(2):
             blown += 0.5 * (s.wind[i] - s.steady[i]) * (s.wind[i] - s.steady[i])
-        p.stir += MARK / STIR * (blown / (gust * gust) - p.stir)
+        p.n_stir = min(p.n_stir + 1.0, STIR / MARK)
+        p.stir += (blown / (gust * gust) - p.stir) / p.n_stir
         p.calm = math.sqrt(min(max(p.stir, CALMEST * CALMEST), 1.0))
 
 
@@ -226,3 +303,57 @@ def change(s: Any, i: int) -> float:
     if k < 0:
         return math.nan
     return float(p.level[i] - p.m_level[k, i] - (p.m_drift[k, i] * (s.t - p.m_t[k]) if i >= FORCES else 0.0))
+
+
+@jit
+def would_show(s: Any, prm: Any, i: int, size: float) -> bool:
+    """Whether a step of a pair [m/s^2, rad/s] would have set off its detector, with a power of 99 %, if it came while that listened.
+
+    A chain follows a step with its gain K, so that its innovations are size (1 - K)^n, with the sum of squares size²/(2K - K²).
+    """
+    p = s.pairs[0]
+    if p.flying == 0 or p.n_blocks < WARM or s.t - p.t_flying < AIRBORNE or p.sd[i] <= 0.0:
+        return False
+    K = p.P[i, 0] / (p.sd[i] * p.sd[i])
+    rho = min(max(p.c1[i] / p.c0[i], 0.0), MOST_RHO)
+    white = p.c0[i] * (1.0 + rho) / (1.0 - rho)
+    root = math.sqrt(prm.diagnosis_pair_threshold * max(1.0, BEYOND_USUAL * p.usual[i])) + POWER
+    return FOUND * size * size / (white * (2.0 * K - K * K)) > root * root
+
+
+@jit
+def hinted(s: Any, g: int, onset: float) -> float:
+    """When the pair of gyro axis ``g`` = 0 to 2, or of accelerometer axis g - 3, alarmed for a fault that began at ``onset``; -1: never."""
+    if len(s.pairs) == 0:
+        return -1.0
+    p = s.pairs[0]
+    if g >= FORCES and p.calm > CALM_ENOUGH:
+        return -1.0
+    t = p.t_hint[3 + g if g < FORCES else g - 3]
+    return float(t) if t > onset - GRID and t < onset + GRID + HINTED else -1.0
+
+
+@jit
+def contradicted(s: Any, prm: Any, g: int, size: float, onset: float) -> bool:
+    """Whether a step of such an axis would have set off the detector of its pair, and has not; a force only says so in still air."""
+    if len(s.pairs) == 0 or prm.diagnosis_vehicle == 0.0:
+        return False
+    p = s.pairs[0]
+    i = 3 + g if g < FORCES else g - 3
+    if s.t < onset + SHOWS or onset < p.t_calm + 2.0 or p.any != 0:
+        return False
+    if i < FORCES and (s.t - p.t_across < FOLLOWS or p.calm > CALM_ENOUGH):
+        return False
+    return would_show(s, prm, i, size) and hinted(s, g, onset) < 0.0
+
+
+@jit
+def vouch(s: Any) -> bool:
+    """Whether the rotors agree with the gyro for some seconds: then a small fault of what else is measured is believed, too."""
+    if len(s.pairs) == 0:
+        return False
+    p = s.pairs[0]
+    for i in range(FORCES, 6):
+        if s.t - p.t_hint[i] < AGREED:
+            return False
+    return bool(p.flying == 1 and p.any == 0 and p.n_blocks >= WARM and s.t - p.t_flying > AIRBORNE)

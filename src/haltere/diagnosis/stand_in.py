@@ -51,7 +51,9 @@ def twist_column(s: Any) -> int:
 def forget(s: Any) -> None:
     """Begin anew: after alignment."""
     p = s.pairs[0]
-    p.any, p.flying, p.head, p.wrong, p.ground = 0, 0, 0, 0, s.p[2]
+    p.any, p.flying, p.head, p.wrong, p.ground, p.lifted = 0, 0, 0, 0, s.p[2], 0
+    for i in range(len(p.lift)):
+        p.lift[i], p.torque[i] = 0.0, 0.0
     p.t_ratio, p.t_mark, p.t_usual = -1e9, -1e9, s.t + 10.0
     for i in range(6):
         p.on[i], p.usual[i], p.peak[i], p.waiting[i] = 0, 0.0, 0.0, 0.0
@@ -126,6 +128,12 @@ def evaluate(s: Any, prm: Any, w: Vec, dt: float) -> None:
     v = air_velocity(s, dcm((s.q[0], s.q[1], s.q[2], s.q[3])), (s.v[0], s.v[1], s.v[2]))
     eta = (p.m[0], p.m[1], p.m[2]) if m.literal == 1 else w
     f, a, D_v, _, M_v, M_w = linear(m, s.speed, s.spin_up, v, w, eta, p.ratio)
+    if p.lifted == 1:
+        for k in range(min(len(s.speed), len(p.lift))):
+            o2 = s.speed[k] * s.speed[k] * p.ratio
+            f = (f[0], f[1], f[2] + p.lift[k] * m.k[2, 0] * o2)
+            t = p.lift[k] * o2
+            a = (a[0] + t * m.k[3, 0] * m.roll[k], a[1] + t * m.k[4, 0] * m.pitch[k], a[2] + p.torque[k] * o2 * m.k[5, 0] * m.yaw[k])
     for i in range(3):
         p.f[i], p.m[i], p.v_a[i] = f[i], a[i], v[i]
         p.turn[i] += a[i] * dt

@@ -18,8 +18,8 @@ def _compare(s: Any, prm: Any, w0: Vec, f0: Vec, w1: Vec, f1: Vec, dt: float) ->
     w0, f0, w1, f1 = stand_in.stand_in(s, prm, w0, f0, w1, f1, dt)
     s.w_raw[0], s.w_raw[1], s.w_raw[2] = w1
     s.f_raw[0], s.f_raw[1], s.f_raw[2] = f1
-    if pairs.gather(s, prm, w_raw, f_raw, dt) and pairs.listen(s, prm):
-        model_faults.judge(s, prm)
+    if pairs.gather(s, prm, w_raw, f_raw, dt):
+        model_faults.hear(s, prm)
     return w0, f0, w1, f1
 
 

@@ -9,10 +9,12 @@ import numpy as np
 from haltere._jit import constant
 from haltere.filter.windows import windows
 
-__all__ = ["MARKS", "PAIR_WINDOW", "pairs"]
+__all__ = ["LATELY", "MARKS", "PAIR_WINDOW", "pairs"]
 
 #: Longest window of the detectors in blocks of a hundredth of a second, in a plain number: it is a modulus.
 PAIR_WINDOW = constant(512)
+#: Blocks whose residuals of rate are kept.
+LATELY = constant(64)
 #: Quarters of a second that the past of each pair is kept.
 MARKS = constant(40)
 
@@ -40,7 +42,12 @@ def pairs() -> np.dtype[np.void]:
                 ("v_a", "f8", 3),
                 ("by_v", "f8", (2, 3, 3)),
                 ("by_w", "f8", (3, 3)),
+                ("hard", "f8"),  # largest moment of late [rad/s^2]
                 ("turn", "f8", 3),  # integral of the model's moment [rad/s]
+                # thrust that rotors were found to have more than their speeds stand for, as a part, and the same of their torque
+                ("lift", "f8", 8),
+                ("torque", "f8", 8),
+                ("lifted", "i8"),
                 ("t", "f8"),
                 # biases that residuals are free of: in use, and the ones to come
                 ("bias", "f8", 6),
@@ -56,8 +63,11 @@ def pairs() -> np.dtype[np.void]:
                 ("drift", "f8", 6),
                 ("P", "f8", (6, 3)),
                 ("sd", "f8", 6),
+                ("scale", "f8", 6),  # noise of the model in this flight over that of the vehicle file, in variances
                 ("n_blocks", "i8"),
-                # innovations: variance against the expected one, product of neighbours, both learnt; measurement variance of a block
+                ("t_calm", "f8"),  # when the chains began anew last
+                # innovations: variance, product of neighbours, both learnt, from how many; measurement variance of a block
+                ("n_learnt", "f8", 6),
                 ("c0", "f8", 6),
                 ("c1", "f8", 6),
                 ("z", "f8", 6),
@@ -77,15 +87,35 @@ def pairs() -> np.dtype[np.void]:
                 ("statistic", "f8"),
                 ("threshold", "f8"),
                 ("mark", "i8"),
-                ("early", "f8", 6),  # change of the levels since the onset, soon after it
-                ("t_across", "f8"),  # last verdict on forces across the thrust axis was pending
+                ("t_hint", "f8", 6),  # last alarm of each pair, whatever came of it
+                ("t_across", "f8"),  # last verdict on forces was pending
+                ("t_step", "f8", 3),  # onset of the last step of a gyro axis that the rotors do not explain, and its size [rad/s]
+                ("step", "f8", 3),
+                ("out", "i8"),  # cause for which the compass was not heard, at the last block
+                ("residual", "f8", 6),  # of the last block
+                ("lately", "f8", (int(LATELY), 3)),  # of the last ones, of rates, and their times
+                ("t_lately", "f8", int(LATELY)),
+                ("n_lately", "i8"),
+                ("lag", "i8"),  # mark of the wind that forces are compared in
+                # trial of what a change of force is: of the model along x, y, z, or wind; misfits, sizes with variances, change of the
+                # wind [m/s] with its covariance (nn, ne, ee), wind before
+                ("trial", "i8"),
+                ("misfit", "f8", 4),
+                ("push", "f8", 3),
+                ("push_var", "f8", 3),
+                ("blown", "f8", 2),
+                ("blown_var", "f8", 3),
+                ("wind", "f8", 2),
                 ("healed", "i8"),
+                ("healed_out", "i8"),
+                ("t_healed", "f8"),
                 ("still", "i8"),  # of forces across the thrust axis: 1 the air was still, -1 it was not, 0 not looked at
                 # faults of the model that last: bits by axis, then by rotor, and sizes
                 ("wrong", "i8"),
                 ("was", "f8", 14),
                 # gusts lately against those the filter expects
                 ("stir", "f8"),
+                ("n_stir", "f8"),
                 ("calm", "f8"),
                 # marks of the past: time, level, drift, turn
                 ("head", "i8"),
@@ -95,6 +125,7 @@ def pairs() -> np.dtype[np.void]:
                 ("m_drift", "f8", (int(MARKS), 6)),
                 ("m_turn", "f8", (int(MARKS), 3)),
                 ("m_var", "f8", (int(MARKS), 6)),
+                ("m_wind", "f8", (int(MARKS), 2)),
             ],
         ),
         align=True,
