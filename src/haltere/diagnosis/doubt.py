@@ -27,9 +27,9 @@ LIFTED, CLEAR, FAST, LOW = 1.5, 0.5, 2.0, 1.0
 #: Faster than this [m/s] nothing is judged: delays, scale and lever arms make errors that look like faults; nor for so long [s] after,
 #: in which biases that were learnt from them are forgotten.
 FASTEST, AFTER_FAST = 18.0, 30.0
-#: Where IMU samples are further apart on average [s], what a rotor shakes is folded to rates at which it looks like a bias. Samples
+#: Where IMU samples are further apart on average [s], what happens between them is unknown for longer than a vehicle moves alike. Samples
 #: over which that is averaged.
-SPARSE, SAMPLES = 0.03, 100.0
+SPARSE, SAMPLES = 0.05, 100.0
 #: How fast [s] it is forgotten how fast the vehicle rose or sank.
 SANK = 5.0
 #: After contact nothing is judged for so long [s]; it is a specific force this far [m/s^2] from the mean of late. After GNSS was forced

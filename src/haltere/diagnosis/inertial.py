@@ -66,7 +66,7 @@ SHOWN, LINEAR = 25.0, 0.02
 CERTAIN = 3.0
 #: Changes that are no fault: slopes, as those of a bias over so long [s]; GNSS velocity [m/s], position [m], heading [rad], height [m].
 RAMP_TIME, VELOCITY_FREE, POSITION_FREE, HEADING_FREE, HEIGHT_FREE = 60.0, 0.7, 1.2, 0.1, 1.0
-#: What a pressure may lag behind the height [s], beside the delay that is known.
+#: What a pressure may lag behind the height [s], beside the delay that is known: faster than HEIGHT_FREE a LATE it makes more than that.
 LATE = 0.35
 #: Largest steps [rad/s, m/s^2], steepest ramps [rad/s^2, m/s^3].
 GYRO_MOST, ACCEL_MOST = 1.0, 8.0
@@ -118,7 +118,7 @@ def free(s: Any, prm: Any, fault: int) -> float:
         return VELOCITY_FREE
     if fault < HEADING:
         return POSITION_FREE if fault < POSITION + 2 else 2.0 * POSITION_FREE
-    return HEIGHT_FREE + LATE * s.bank[0].sank if fault == BAROMETER_OFFSET else HEADING_FREE
+    return max(HEIGHT_FREE, LATE * s.bank[0].sank) if fault == BAROMETER_OFFSET else HEADING_FREE
 
 
 @jit

@@ -155,7 +155,7 @@ def diagnosis_in_words(summary: dict[str, Any]) -> str:
     if said["judged_s"] < 1.0:
         return (
             "diagnosis of gyro and accelerometer axes: on, but only dead or stepping axes could be seen: the others need GNSS, a known "
-            f"attitude, flight and more than 33 samples a second; {found}"
+            f"attitude, flight and more than 20 samples a second; {found}"
         )
     return f"diagnosis of gyro and accelerometer axes: on, during {said['judged_s']:.0f} of {said['of_s']:.0f} s; {found}"
 
