@@ -106,7 +106,7 @@ def _diagnosis(solution: Solution, facts: dict[str, Any]) -> dict[str, Any]:
     if facts.get("watched") is None:
         return {"inertial": "off"}
     named = [e for e in solution.events if e["sensor"] in ("gyro", "accel") and e["t_isolated"] is not None]
-    axes = list(dict.fromkeys(f"{e['sensor']}.{e['axis']}" for e in named))
+    axes = list(dict.fromkeys(c for e in named for c in e["candidates"] if c.startswith(("gyro.", "accel."))))  # of the unit that is used
     return {
         "inertial": "on",
         "judged_s": round(facts["watched"], 1),
