@@ -50,13 +50,11 @@ MISSIONS = ("hover", "lissajous", "box")
 START, AFTER = 24.0, 16.0
 #: Log whose track the mission ``track`` flies, set by ``--track``.
 TRACK: list[Path] = []
-#: It is off by default.
-ON = {"diagnosis.inertial": "on"}
 
 
 def outcome(flight: FlightLog, **options: Any) -> dict[str, Any]:
     """What became of the one fault of a flight."""
-    solution = haltere.run(flight, scored=False, set={"diagnosis.inertial": "on", **options})
+    solution = haltere.run(flight, scored=False, set=options)
     (o,) = detections(solution.events, flight.meta.faults[-1:], float(solution.t[0]), float(solution.t[-1])).outcomes
     return {"isolation": o.isolation or "missed", "delay": o.delay, "named_after": o.isolation_delay, "named": list(o.named)}
 
@@ -109,7 +107,7 @@ def false_alarms(hours: float) -> dict[str, Any]:
     flown, i = 0.0, 0
     while flown < hours * 3600.0:
         mission, wind = missions[i % len(missions)], list(WINDS)[(i // len(missions)) % 2]
-        solution = haltere.run(simulate(Scenario(mission=mission, duration=120.0, seed=60000 + i, wind=WINDS[wind])), set=ON, scored=False)
+        solution = haltere.run(simulate(Scenario(mission=mission, duration=120.0, seed=60000 + i, wind=WINDS[wind])), scored=False)
         for e in alarms(solution.events):
             what = {k: e[k] for k in ("sensor", "axis", "kind", "t_onset", "t_detected", "t_isolated", "statistic")}
             found.append({"mission": mission, "wind": wind, "seed": 60000 + i, **what})
@@ -142,7 +140,7 @@ def real(data: Path) -> list[dict[str, Any]]:
     for name, (flight, end) in flights.items():
         if end < math.inf:
             flight = FlightLog({k: s.where(s.t <= end) for k, s in flight.streams.items()}, flight.meta)
-        clean = haltere.run(flight, set=ON, scored=False)
+        clean = haltere.run(flight, scored=False)
         mine = [e for e in alarms(clean.events) if e["sensor"] != "magnetometer"]
         out = {
             "flight": name,

@@ -18,7 +18,6 @@ from haltere.simulate import Scenario, simulate
 from haltere.strapdown.layout import layout
 
 NO_ROW = (NONE, NONE, NONE)
-ON = {"diagnosis.inertial": "on"}
 
 
 def state() -> Any:
@@ -97,4 +96,4 @@ def test_near_the_ground_is_low_over_where_it_rested_and_slow(height: float, spe
 def test_touchdown_is_no_fault(seed: int) -> None:
     """Two landings in gusts whose contact looked like a step of the gyro's x axis."""
     flight = simulate(Scenario(mission="lissajous", duration=120.0, seed=60000 + seed, wind={"n": 5.2, "e": 3.0, "gust": 1.2}))
-    assert alarms(run(flight, scored=False, set=ON).events) == []
+    assert alarms(run(flight, scored=False).events) == []

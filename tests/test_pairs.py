@@ -71,7 +71,6 @@ def test_wind_convicts_nobody(identified: Vehicle) -> None:
     assert not told(identified, "", n=5.2, e=3.0, gust=1.2)
 
 
-@pytest.mark.xfail(strict=True, reason="the end of a moment's fault is told 1.8 s late since the chains follow the flight's own noise")
 def test_a_fault_that_ends_is_over(identified: Vehicle) -> None:
     events = told(identified, f"model.r:bias=3rad/s2@{AT:g}-{AT + 6:g}", end=14.0)
     assert [e["axis"] for e in events] == ["r"]

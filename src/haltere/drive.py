@@ -517,4 +517,5 @@ def _facts(
         "origin": origin, "aligned_at": float(S["t_aligned"][0]), "discarded": lost, "warnings": warnings, "gaps": int(S["n_gaps"][0]),
         "steps": int(S["n_steps"][0]), "rows": n, "duration": float(t[-1] - t[0]),
         "timings": {"prepare_s": prepared - began, "filter_s": filtered - prepared},
+        "watched": float(S["bank"]["watched"][0, 0]) if "bank" in (S.dtype.names or ()) and S["bank"].shape[1] else None,
     }  # fmt: skip

@@ -39,7 +39,7 @@ def _errors(what: str, rows: dict[str, dict[str, float]]) -> list[str]:
 
 def lines(solution: Solution, flight: FlightLog, folder: Path) -> list[str]:
     """The summary for people."""
-    from haltere.report.words import verdict_of, wind_in_words
+    from haltere.report.words import diagnosis_in_words, verdict_of, wind_in_words
 
     summary = solution.summary
     said = verdict_of(solution, flight)
@@ -58,6 +58,8 @@ def lines(solution: Solution, flight: FlightLog, folder: Path) -> list[str]:
         out.append(f"wind: {': '.join(w for w in (wind_in_words(summary['wind']), summary['wind']['verdict']) if w)}")
     if summary["health"]:
         out.append("health: " + ", ".join(f"{sensor} {h['verdict']}" for sensor, h in summary["health"].items()))
+    if diagnosis_in_words(summary):
+        out.append(diagnosis_in_words(summary))
     for event in [e for e in solution.events if e["kind"] != "aligned"][:8]:
         out.append(f"event: t = {event['t_detected']:.2f} s, {event['sensor']} {event['kind']}: {event['evidence']}")
     lost = {n: sum(s["discarded"].values()) for n, s in summary["streams"].items() if s["discarded"]}

@@ -17,14 +17,21 @@ from haltere.aids.fusing import FORCED
 from haltere.aids.record import GNSS_POSITION, GNSS_VELOCITY
 from haltere.core.rotation import Vec
 
-__all__ = ["begin", "contact", "fits", "judged", "left", "may_name", "named", "near_ground", "vouched", "watch"]
+__all__ = ["begin", "contact", "fits", "judged", "left", "may_name", "named", "near_ground", "note", "sparse", "vouched", "watch"]
 
 #: Families of inertial faults, the first ones.
 N_INERTIAL = constant(6)
-#: Height [m] and speed [m/s] above which a vehicle that rested is in the air, and those below which it may touch the ground.
-LIFTED, FAST, LOW = 1.5, 2.0, 1.0
-#: Faster than this [m/s] nothing is judged, nor for so long [s] after: delays, scale and lever arms make errors that look like faults.
-FASTEST, AFTER_FAST = 18.0, 10.0
+#: Height [m] over where it rested from which a vehicle is in the air; that from which it is if faster than so many m/s (lower it may roll);
+#: height below which one that is slower may touch the ground.
+LIFTED, CLEAR, FAST, LOW = 1.5, 0.5, 2.0, 1.0
+#: Faster than this [m/s] nothing is judged: delays, scale and lever arms make errors that look like faults; nor for so long [s] after,
+#: in which biases that were learnt from them are forgotten.
+FASTEST, AFTER_FAST = 18.0, 30.0
+#: Where IMU samples are further apart on average [s], what happens between them is unknown for longer than a vehicle moves alike. Samples
+#: over which that is averaged.
+SPARSE, SAMPLES = 0.05, 100.0
+#: How fast [s] it is forgotten how fast the vehicle rose or sank.
+SANK = 5.0
 #: After contact nothing is judged for so long [s]; it is a specific force this far [m/s^2] from the mean of late. After GNSS was forced
 #: in, and after a gap of the IMU.
 CONTACT, PUSHED, AFTER_FORCED, AFTER_GAP = 1.0, 20.0, 5.0, 3.0
@@ -43,6 +50,7 @@ def begin(s: Any) -> None:
     """Begin anew, at alignment: the vehicle may be anywhere."""
     b = s.bank[0]
     b.aloft, b.floor, b.t_rest, b.t_contact, b.t_unfit, b.t_doubt = 0, s.p[2], -1e9, -1e9, -1e9, -1e9
+    b.sank = 0.0
     for g in range(len(b.t_named)):
         b.t_named[g], b.n_named[g], b.t_mute[g] = -1e9, 0, -1e9
 
@@ -53,6 +61,20 @@ def contact(s: Any, f: Vec) -> None:
     a = math.sqrt(f[0] * f[0] + f[1] * f[1] + f[2] * f[2])
     if abs(a - s.rest.mean_a) > PUSHED:
         s.bank[0].t_contact = s.t
+
+
+@jit
+def note(s: Any, dt: float) -> None:
+    """Take one step into how far IMU samples are apart, and how fast the vehicle rose or sank of late."""
+    b = s.bank[0]
+    b.spacing += (dt - b.spacing) / SAMPLES if b.spacing > 0.0 else dt
+    b.sank = max(abs(s.v[2]), b.sank * (1.0 - min(1.0, dt / SANK)))
+
+
+@jit
+def sparse(b: Any) -> bool:
+    """Whether IMU samples are too far apart for a verdict on an axis."""
+    return bool(b.spacing > SPARSE)
 
 
 @jit
@@ -82,7 +104,8 @@ def watch(s: Any, prm: Any) -> None:
     elif b.aloft == 0:
         speed2 = s.v[0] * s.v[0] + s.v[1] * s.v[1] + s.v[2] * s.v[2]
         never = b.t_rest < 0.0 and s.align.kind != 1 and s.t - s.t_aligned > 2.0
-        if abs(s.p[2] - b.floor) > LIFTED or speed2 > FAST * FAST or never:
+        rise = abs(s.p[2] - b.floor)
+        if rise > LIFTED or (rise > CLEAR and speed2 > FAST * FAST) or never:
             b.aloft = 1
 
 

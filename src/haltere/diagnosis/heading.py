@@ -1,8 +1,7 @@
-"""What the compass says between faults: the change of heading since an onset, and a compass that turns because the gyro does. No alarm.
+"""A compass that its watch has put out since it turns, when it is the gyro that turns. It raises no alarm.
 
-A filter takes a compass for hardly better than its calibration, but without turning no calibration error changes, so that a change is
-known much better (`haltere.aids.compass`). A compass that turns against the gyro is a disturbance, or the gyro's vertical axis: a step in
-the raw rate of the same size and time says the gyro, and so does a turn that goes on at the same rate further than a disturbance swings.
+A compass that turns against the gyro (`haltere.aids.compass`) is a disturbance, or the gyro's vertical axis: a step in the raw rate of the
+same size and time says the gyro, and so does a turn that goes on at the same rate further than a disturbance swings.
 """
 
 from __future__ import annotations
@@ -13,34 +12,16 @@ from typing import Any
 from haltere._jit import jit
 from haltere.aids import compass
 from haltere.aids.record import E_FAULT, NO_SENSOR, event_since
-from haltere.core.rotation import Vec
 from haltere.diagnosis.steps import shown
 from haltere.filter.signatures import GYRO, SLOTS
 
-__all__ = ["by_heading", "gyro_that_turns"]
+__all__ = ["gyro_that_turns"]
 
-#: Most that the change of heading may say.
-SAYS = 40.0
 #: A turn that goes on: this far [rad], so many times as long as when it was noticed, at the same rate within this part, at least this fast:
 #: a field that creeps turns a compass slower, and not as far.
 FAR, LONGER, SAME, SLOWEST = math.radians(60.0), 2.0, 0.25, math.radians(4.0)
 #: From this part of a threshold on something may have tilted the attitude.
 TILTED = 0.35
-
-
-@jit
-def by_heading(s: Any, prm: Any, row: Vec, k: int, j: int, size: float) -> float:
-    """What the change of heading since onset ``k`` says for column ``j``: gain in twice the log likelihood over no fault."""
-    b = s.bank[0]
-    q = b.q[k]
-    same = s.q[0] * q[0] + s.q[1] * q[1] + s.q[2] * q[2] + s.q[3] * q[3]
-    turned = 2.0 * math.sqrt(max(0.0, 1.0 - same * same))
-    change = b.heading - b.heading_then[k]
-    turned = max(0.0, turned - abs(change))  # a gyro that fails turns the estimate, not the compass
-    wrong = prm.robust_calibration * turned / math.cos(s.field[1])
-    variance = prm.robust_heading * prm.robust_heading + wrong * wrong
-    left = change - size * (row[0] * b.x[0, j] + row[1] * b.x[1, j] + row[2] * b.x[2, j])
-    return min(max((change * change - left * left) / variance, -SAYS), SAYS)
 
 
 @jit

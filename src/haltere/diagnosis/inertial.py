@@ -14,13 +14,13 @@ from typing import Any
 from haltere._jit import constant, jit
 from haltere.aids import compass
 from haltere.aids.fusing import DISTRUSTED, RUNNING
-from haltere.aids.magnetometer import heading_row
 from haltere.aids.record import E_FAULT, E_SUSPECT, GNSS_POSITION, GNSS_VELOCITY, NO_SENSOR, event_since
 from haltere.core.rotation import Mat, dcm
 from haltere.diagnosis import doubt, pairs, steps
-from haltere.diagnosis.heading import by_heading, gyro_that_turns
+from haltere.diagnosis.heading import gyro_that_turns
 from haltere.diagnosis.healing import follow, heal, heal_between
 from haltere.diagnosis.steps import refuted, shown
+from haltere.filter import turning
 from haltere.filter.signatures import (
     ACCEL,
     ACCEL_RAMP,
@@ -48,6 +48,8 @@ FAMILIES = (
 )  # fmt: skip
 N_FAMILIES = constant(14)
 F_ACCEL, F_VELOCITY, F_POSITION, F_COMPASS, F_BAROMETER = (constant(i) for i in (3, 6, 9, 12, 13))
+#: The gyro's axis that is next to vertical.
+VERTICAL = constant(2)
 NONE = constant(-1)
 #: Spacing of new onsets, how old the oldest may be, time between judgements, and how long a set is kept for itself [s].
 GRID, OLDEST, EVERY, TELL = 0.25, 15.0, 0.1, 2.5
@@ -62,10 +64,14 @@ MARGIN, MARGIN_ALIKE = 9.0, 16.0
 #: What it says for a gyro axis that the raw samples show its step; margins as a part of the statistic, since responses are linear and
 #: onsets on a grid.
 SHOWN, LINEAR = 25.0, 0.02
+#: How sure [sigma] it must be that a fault is more than such a change before it is told.
+CERTAIN = 3.0
 #: Changes that are no fault: slopes, as those of a bias over so long [s]; GNSS velocity [m/s], position [m], heading [rad], height [m].
-RAMP_TIME, VELOCITY_FREE, POSITION_FREE, HEADING_FREE, HEIGHT_FREE = 30.0, 0.7, 1.2, 0.1, 1.0
+RAMP_TIME, VELOCITY_FREE, POSITION_FREE, HEADING_FREE, HEIGHT_FREE = 60.0, 0.7, 1.2, 0.1, 1.0
 #: Part of them while the vehicle's model agrees with the IMU.
 VOUCHED = 0.4
+#: What a pressure may lag behind the height [s], beside the delay that is known: faster than HEIGHT_FREE a LATE it makes more than that.
+LATE = 0.35
 #: Largest steps [rad/s, m/s^2], steepest ramps [rad/s^2, m/s^3].
 GYRO_MOST, ACCEL_MOST = 1.0, 8.0
 GYRO_STEEPEST, ACCEL_STEEPEST = math.radians(0.3), 0.12
@@ -102,7 +108,7 @@ def family_of(fault: int) -> int:
 
 
 @jit
-def free(prm: Any, fault: int) -> float:
+def free(s: Any, prm: Any, fault: int) -> float:
     """Size that is no fault."""
     if fault < ACCEL:
         return float(prm.diagnosis_gyro)
@@ -116,7 +122,18 @@ def free(prm: Any, fault: int) -> float:
         return VELOCITY_FREE
     if fault < HEADING:
         return POSITION_FREE if fault < POSITION + 2 else 2.0 * POSITION_FREE
-    return HEIGHT_FREE if fault == BAROMETER_OFFSET else HEADING_FREE
+    return max(HEIGHT_FREE, LATE * s.bank[0].sank) if fault == BAROMETER_OFFSET else HEADING_FREE
+
+
+@jit
+def changed(s: Any, prm: Any, fault: int, k: int) -> bool:
+    """Whether an inertial fault has come to more than a change that is no fault, with `CERTAIN` sigma; a ramp by its time."""
+    b = s.bank[0]
+    j = fault * SLOTS + k
+    lasted = s.t - b.onset[k] if fault >= GYRO_RAMP else 1.0
+    gyro = fault < ACCEL or (fault >= GYRO_RAMP and fault < ACCEL_RAMP)
+    least = (abs(b.num[j]) / b.den[j] - CERTAIN / math.sqrt(b.den[j])) * lasted
+    return bool(least > (prm.diagnosis_gyro if gyro else prm.diagnosis_accel))
 
 
 @jit
@@ -152,7 +169,7 @@ def next_slot(b: Any, t: float) -> int:
 @jit
 def known(s: Any) -> bool:
     """Whether the attitude is known well enough for linear responses, and GNSS speaks: without it nothing tells one axis from another."""
-    if s.t - s.aid[GNSS_VELOCITY].t_offered > SPOKEN:
+    if doubt.sparse(s.bank[0]) or s.t - s.aid[GNSS_VELOCITY].t_offered > SPOKEN:
         return False
     return compass.tilt_variance(s) < TILT_KNOWN * TILT_KNOWN and compass.yaw_sd(s) < YAW_KNOWN
 
@@ -171,6 +188,10 @@ def tick(s: Any, prm: Any, dt: float) -> bool:
     """After fusion: open onsets, judge; True when a named fault has changed the state beyond what its measurements did."""
     b = s.bank[0]
     follow(s, dt)
+    doubt.note(s, dt)
+    calibration = prm.robust_calibration / max(math.cos(s.field[1]), 0.1)
+    w, down = (s.w[0], s.w[1], s.w[2]), dcm((s.q[0], s.q[1], s.q[2], s.q[3]))[2]
+    turning.suppose(b, prm.noise_gyro, prm.noise_gyro_scale, prm.noise_gyro_bias, calibration, w, down, dt)
     if b.n_aligned != s.n_aligned or abs(s.yaw_corrected - b.yaw) > 0.5:
         clear(b)
         if b.n_aligned != s.n_aligned:
@@ -199,6 +220,8 @@ def tick(s: Any, prm: Any, dt: float) -> bool:
         return False
     b.t_judge = s.t + EVERY - 1e-6
     doubt.watch(s, prm)
+    if known(s) and doubt.judged(s) and not sick(s):
+        b.watched += EVERY
     k = gyro_that_turns(s)
     if k >= 0:
         heal(s, GYRO + 2, k)
@@ -236,12 +259,10 @@ def weigh(s: Any, prm: Any) -> tuple[int, float]:
     for g in range(N_FAMILIES):
         b.level[g], b.beyond[g], b.fault[g], b.slot[g] = 0.0, 0.0, NONE, 0
     b.ratio, tilting = 0.0, 0.0
-    heard = s.has_field == 1 and s.compass.out == 0 and s.t - b.t_heading < 0.5
-    sure = pairs.vouch(s)
-    row = heading_row(dcm((s.q[0], s.q[1], s.q[2], s.q[3])), s.field[0], s.field[1])
+    turned, sure = 0.0, pairs.vouch(s)
     for f in range(N_FAULTS):
         g = family_of(f)
-        tolerance, largest, least = free(prm, f), most(f), 0.25 * prm.diagnosis_threshold
+        tolerance, largest, least = free(s, prm, f), most(f), 0.25 * prm.diagnosis_threshold
         if sure and f >= VELOCITY:
             tolerance *= VOUCHED
         h = prm.diagnosis_threshold * (1.0 if g < F_VELOCITY else OTHERS)
@@ -257,19 +278,21 @@ def weigh(s: Any, prm: Any) -> tuple[int, float]:
                     continue
                 if f < GYRO_RAMP and pairs.contradicted(s, prm, g, size, b.onset[k]):
                     continue
-                said = 0.0
-                if heard and f < VELOCITY:
-                    said = by_heading(s, prm, row, k, j, math.copysign(size, b.num[j]))
-                if level + said > b.level[g]:
-                    b.level[g], b.fault[g], b.slot[g] = level + said, f, k
+                if level > b.level[g]:
+                    b.level[g], b.fault[g], b.slot[g] = level, f, k
+                    if g == VERTICAL:
+                        turned = b.heading_num[j] * b.heading_num[j] / max(b.heading_den[j], 1e-9)
                 if num <= tolerance * den:
                     continue
                 beyond = (level - tolerance * (2.0 * num - tolerance * den)) / h
                 b.beyond[g] = max(b.beyond[g], beyond)
-                if g < F_VELOCITY and g != 2 and beyond > b.ratio:
+                if g < F_VELOCITY and g != VERTICAL and beyond > b.ratio:
                     b.ratio, tilting = beyond, level
     if tilting < b.level[F_COMPASS]:
         b.ratio = 0.0
+    turned = min(turned, b.level[VERTICAL])  # a compass that turns as that gyro would have it explains as much of the heading
+    if turned > b.level[F_COMPASS]:
+        b.level[F_COMPASS], b.fault[F_COMPASS], b.slot[F_COMPASS] = turned, YAW, b.slot[VERTICAL]
     for g in range(F_ACCEL):
         if b.beyond[g] > 0.5 and (in_samples(s, g) or pairs.hinted(s, g, b.onset[b.slot[g]]) >= 0.0):
             b.level[g] += SHOWN
@@ -319,6 +342,8 @@ def judge(s: Any, prm: Any) -> bool:
         return False
     if not doubt.may_name(b, lead, s.t) or not doubt.judged(s) or not doubt.fits(s, b.fault[lead] * SLOTS + k, k):
         return False  # what is wrong is in no list
+    if lead < F_VELOCITY and not changed(s, prm, b.fault[lead], k):
+        return False
     candidates, others = 1 << lead, 0
     top = b.level[lead]
     for g in range(N_FAMILIES):

@@ -12,7 +12,7 @@ from __future__ import annotations
 import math
 from typing import Any
 
-from haltere._jit import constant, jit
+from haltere._jit import constant, jit, where
 from haltere.aids.air import wind_n
 from haltere.core.rotation import Vec, dcm, tmat_vec
 from haltere.diagnosis.stand_in import across, density_of_noise, mark_before, offset_variance
@@ -322,10 +322,7 @@ def would_show(s: Any, prm: Any, i: int, size: float) -> bool:
 
 
 @jit
-def hinted(s: Any, g: int, onset: float) -> float:
-    """When the pair of gyro axis ``g`` = 0 to 2, or of accelerometer axis g - 3, alarmed for a fault that began at ``onset``; -1: never."""
-    if len(s.pairs) == 0:
-        return -1.0
+def _hinted(s: Any, g: int, onset: float) -> float:
     p = s.pairs[0]
     if g >= FORCES and p.calm > CALM_ENOUGH:
         return -1.0
@@ -334,9 +331,17 @@ def hinted(s: Any, g: int, onset: float) -> float:
 
 
 @jit
-def contradicted(s: Any, prm: Any, g: int, size: float, onset: float) -> bool:
-    """Whether a step of such an axis would have set off the detector of its pair, and has not; a force only says so in still air."""
-    if len(s.pairs) == 0 or prm.diagnosis_vehicle == 0.0:
+def _no_hint(s: Any, g: int, onset: float) -> float:
+    return -1.0
+
+
+#: When the pair of gyro axis ``g`` = 0 to 2, or of accelerometer axis g - 3, alarmed for a fault that began at ``onset``; -1: never.
+hinted = where("pairs", _hinted, _no_hint)
+
+
+@jit
+def _contradicted(s: Any, prm: Any, g: int, size: float, onset: float) -> bool:
+    if prm.diagnosis_vehicle == 0.0:
         return False
     p = s.pairs[0]
     i = 3 + g if g < FORCES else g - 3
@@ -348,12 +353,27 @@ def contradicted(s: Any, prm: Any, g: int, size: float, onset: float) -> bool:
 
 
 @jit
-def vouch(s: Any) -> bool:
-    """Whether the rotors agree with the gyro for some seconds: then a small fault of what else is measured is believed, too."""
-    if len(s.pairs) == 0:
-        return False
+def _uncontradicted(s: Any, prm: Any, g: int, size: float, onset: float) -> bool:
+    return False
+
+
+#: Whether a step of such an axis would have set off the detector of its pair, and has not; a force only says so in still air.
+contradicted = where("pairs", _contradicted, _uncontradicted)
+
+
+@jit
+def _vouch(s: Any) -> bool:
     p = s.pairs[0]
     for i in range(FORCES, 6):
         if s.t - p.t_hint[i] < AGREED:
             return False
     return bool(p.flying == 1 and p.any == 0 and p.n_blocks >= WARM and s.t - p.t_flying > AIRBORNE)
+
+
+@jit
+def _no_vouch(s: Any) -> bool:
+    return False
+
+
+#: Whether the rotors agree with the gyro for some seconds: then a small fault of what else is measured is believed, too.
+vouch = where("pairs", _vouch, _no_vouch)

@@ -33,6 +33,8 @@ MEMORY, ALERT, WARM, LONE = 2.0, 0.5, 250, 9.0
 LARGE, ASIDE, QUIET, LEVEL, BETTER = 9.0, 0.4, 6.0, 2.3, 18.0
 #: Square of a specific force beside the half before, of 3 degrees of freedom, that is a shock.
 SHOCK = 20.0
+#: Motors carry the vehicle at a specific force from here on [m/s^2]; rotors that are braked or driven turn it at once (§19).
+CARRIED = 4.9
 #: After rest steps are not looked for during this time [s].
 SPIN_UP = 2.0
 #: Part of a step that its size may be off by, 1 sigma.
@@ -165,6 +167,15 @@ def step_of(s: Any, c: int, t: float) -> bool:
             x = d.u[(h - i) % n, a] - level
             q += x * x / max(d.square[a], 1e-12)
         if q > SHOCK:
+            return False
+    for o in range(2):
+        q = 0.0
+        for a in range(3, 6):
+            level = 0.0
+            for i in range(HALF):
+                level += d.u[(h - o * (HALF + 1) - i) % n, a] / HALF
+            q += level * level
+        if q < CARRIED * CARRIED:
             return False
     after, before = 0.0, 0.0
     for i in range(HALF):

@@ -17,6 +17,7 @@ from typing import Any
 import numpy as np
 
 from haltere._jit import constant, jit
+from haltere.filter import turning
 from haltere.filter.update import Row
 
 __all__ = [
@@ -52,8 +53,6 @@ SLOTS = constant(20)
 BANK_COLUMNS = int(N_FAULTS * SLOTS)
 #: Columns that are worked on together: what of them is needed stays in the nearest cache.
 WIDTH = constant(60)
-#: How fast the heading's innovation is smoothed, a part each sample.
-HEARD = 0.2
 #: Responses are in single precision: a statistic need not be better, and twice as many are worked on at once.
 ZERO, ONE = np.float32(0.0), np.float32(1.0)
 #: A whitened innovation counts up to so many sigma, more by this factor of the one before it: a lone outlier proves nothing. Beyond, its
@@ -90,7 +89,7 @@ def clear(b: Any) -> None:
     """Forget every onset and response."""
     x = b.x
     for j in range(x.shape[1]):
-        b.num[j], b.den[j] = 0.0, 0.0
+        b.num[j], b.den[j], b.heading_num[j], b.heading_den[j] = 0.0, 0.0, 0.0, 0.0
     for i in range(x.shape[0]):
         for j in range(x.shape[1]):
             x[i, j] = 0.0
@@ -99,6 +98,7 @@ def clear(b: Any) -> None:
     for k in range(len(b.last)):
         b.last[k] = 0.0
     b.fresh, b.alarm = 0, 0
+    turning.restart(b)
     restart_transition(b)
 
 
@@ -107,12 +107,11 @@ def open_slot(s: Any, k: int, down: Vec) -> None:
     """Let slot ``k`` stand for faults that begin now; ``down`` is the vertical in the body frame."""
     b = s.bank[0]
     x = b.x
-    b.live[k], b.onset[k], b.heading_then[k] = 1, s.t, b.heading
-    for i in range(4):
-        b.q[k, i] = s.q[i]
+    b.live[k], b.onset[k] = 1, s.t
     for f in range(N_FAULTS):
         j = f * SLOTS + k
-        b.num[j], b.den[j] = 0.0, 0.0
+        b.num[j], b.den[j], b.heading_num[j], b.heading_den[j] = 0.0, 0.0, 0.0, 0.0
+        b.heading_o[j], b.heading_d[j] = 0.0, 0.0
         for i in range(x.shape[0]):
             x[i, j] = 0.0
     b.excess[k], b.spread[k] = 0.0, 0.0
@@ -215,7 +214,8 @@ def matched(s: Any, H: Row, S: float, y: float, component: int, evidence: bool, 
         move(b)
     x, e, num, den = b.x, b.e, b.num, b.den
     z, weight = 0.0, 0.0
-    if evidence:
+    heading = evidence and component == C_HEADING
+    if evidence and not heading:
         z = y / math.sqrt(S)
         most = ALONE + FOLLOWED * abs(b.last[component])
         share = min(1.0, most / max(abs(z), 1e-9))
@@ -224,9 +224,8 @@ def matched(s: Any, H: Row, S: float, y: float, component: int, evidence: bool, 
         z = weight * y
         b.fresh = 1
         add_square(b, s.t, component, z * y)
-        if component == C_HEADING:
-            b.heading += HEARD * (y - b.heading)
-            b.t_heading = s.t
+    if heading:
+        b.t_heading = s.t
     z4, weight4 = np.float32(z), np.float32(weight)
     own = -1
     if evidence and component < N_GNSS:
@@ -244,7 +243,7 @@ def matched(s: Any, H: Row, S: float, y: float, component: int, evidence: bool, 
         if c <= own and own < c + WIDTH:
             for j in range(own, own + SLOTS):
                 e[j] += ONE
-        if evidence:
+        if evidence and not heading:
             for j in range(c, c + WIDTH):
                 num[j] += z4 * e[j]
                 den[j] += weight4 * e[j] * e[j]
@@ -254,3 +253,8 @@ def matched(s: Any, H: Row, S: float, y: float, component: int, evidence: bool, 
                 if k != 0.0:
                     for j in range(c, c + WIDTH):
                         x[i, j] -= k * e[j]
+    if heading:
+        square = turning.hear(b, s.t, y)
+        if square >= 0.0:
+            b.fresh = 1
+            add_square(b, s.t, component, square)

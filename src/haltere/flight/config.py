@@ -278,7 +278,7 @@ KEYS: dict[str, Key] = {
         ("off", "vanes", "drag", "auto"),
     ),
     "diagnosis.inertial": switch(
-        "off",
+        "on",
         "Look for faults of gyro and accelerometer axes by their signature in the innovations, name them, and take their effect back.",
     ),
     "diagnosis.false_alarms": positive(0.035, "1/h", "Wanted rate of false alarms; lower finds faults later."),
@@ -370,7 +370,7 @@ _NO_AIR: dict[str, Value] = {"aid.drag": "off", "aid.airdata": "off", "aid.vanes
 #: What an estimator sets differently from the defaults above.
 _OVERRIDES: dict[str, dict[str, Value]] = {
     "navigator": {},
-    "fault-tolerant": {**_NO_AIR, "diagnosis.inertial": "on"},
+    "fault-tolerant": {**_NO_AIR},
     "ahrs": {
         "aid.gnss": "off", "aid.barometer": "off", "aid.fake_velocity": "on", "aid.fake_position": "off", "baro.offset": "off",
         "diagnosis.inertial": "off",

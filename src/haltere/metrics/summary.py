@@ -94,10 +94,25 @@ def summarise(solution: Solution, flight: FlightLog, facts: dict[str, Any], scor
     if wind:
         summary["wind"] = wind
     summary["findings"] = findings(summary["sensors"])
+    summary["diagnosis"] = _diagnosis(solution, facts)
     unused = "wind" in flight and len(flight["wind"]) > 0 and "wind_n" not in solution
     summary["warnings"] = facts["warnings"] + ([UNUSED_WIND] if unused else [])
     summary["timings"] = facts["timings"]
     solution.summary = finite(summary)
+
+
+def _diagnosis(solution: Solution, facts: dict[str, Any]) -> dict[str, Any]:
+    """Whether axes of the IMU were diagnosed, for how long what was measured allowed a verdict [s], and what was named."""
+    if facts.get("watched") is None:
+        return {"inertial": "off"}
+    named = [e for e in solution.events if e["sensor"] in ("gyro", "accel") and e["t_isolated"] is not None]
+    axes = list(dict.fromkeys(c for e in named for c in e["candidates"] if c.startswith(("gyro.", "accel."))))  # of the unit that is used
+    return {
+        "inertial": "on",
+        "judged_s": round(facts["watched"], 1),
+        "of_s": round(float(solution.t[-1] - solution.t[0]), 1),
+        "named": axes,
+    }
 
 
 def _health(solution: Solution, flight: FlightLog) -> dict[str, dict[str, str]]:

@@ -16,7 +16,7 @@ from haltere.report.context import Context, Episode, sensor_label
 from haltere.report.series import Pool
 
 __all__ = [
-    "Verdict", "count", "discarded", "facts", "fixed", "nis_in_words", "number", "verdict", "verdict_of",
+    "Verdict", "count", "diagnosis_in_words", "discarded", "facts", "fixed", "nis_in_words", "number", "verdict", "verdict_of",
     "whiteness_in_words", "wind_in_words",
 ]  # fmt: skip
 
@@ -119,6 +119,8 @@ def verdict(c: Context) -> Verdict:
         worst = 1
     out = Verdict(("good", "doubtful", "bad")[worst], headline)
     out.sentences += [_coverage(c), *_health(by_level, health), *(_finding_in_words(f) for f in found)]
+    if diagnosis_in_words(summary):
+        out.sentences.append(f"D{diagnosis_in_words(summary)[1:]}.")
     out.sentences += [*_what_happened(c), *_quality(c), *_left_out(summary)]
     return out
 
@@ -142,6 +144,20 @@ def _health(by_level: dict[str, list[str]], health: dict[str, Any]) -> list[str]
         for word in ("bad", "doubtful")
         for s in by_level[word]
     ]
+
+
+def diagnosis_in_words(summary: dict[str, Any]) -> str:
+    """What was watched for failing axes of the IMU, and for how long; empty where nobody asked."""
+    said = summary.get("diagnosis", {})
+    if said.get("inertial") != "on":
+        return ""
+    found = f"named {_list(said['named'])}" if said["named"] else "none named"
+    if said["judged_s"] < 1.0:
+        return (
+            "diagnosis of gyro and accelerometer axes: on, but only dead or stepping axes could be seen: the others need GNSS, a known "
+            f"attitude, flight and more than 20 samples a second; {found}"
+        )
+    return f"diagnosis of gyro and accelerometer axes: on, during {said['judged_s']:.0f} of {said['of_s']:.0f} s; {found}"
 
 
 def _unit_label(finding: dict[str, Any]) -> str:

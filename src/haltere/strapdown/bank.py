@@ -55,6 +55,31 @@ STEPS = _record(
     ("n", "i8"),
 )
 
+#: What `haltere.filter.turning` knows of the innovations of heading.
+_TRACK = _record(
+    ("t", "f8"),  # last sample: time, value; number since the beginning
+    ("y", "f8"),
+    ("n", "i8"),
+    ("o", "f8"),  # offset and drift, and their covariance
+    ("d", "f8"),
+    ("oo", "f8"),
+    ("od", "f8"),
+    ("dd", "f8"),
+    ("q", "f8"),  # what has been added to that since the last sample
+    ("q_drift", "f8"),
+    ("r", "f8"),  # white variance, and from how many it is known
+    ("known", "f8"),
+    ("last", "f8"),  # whitened one before
+    ("sum", "f8"),  # of the whitened ones of this block, their number, when it began
+    ("samples", "f8"),
+    ("t_block", "f8"),
+    ("late", "f8", 8),  # squares of the means of the last blocks
+    ("blocks", "i8"),
+    ("share", "f8"),  # of what a compass may turn by itself, as this flight shows
+    ("w", "f8", 3),  # rate of late across the vertical, and about it
+    ("about", "f8"),
+)
+
 #: Part of Φ since the last fusion, see `haltere.filter.signatures.move`.
 _TRANSITION = _record(("P", "f8", (15, 15)))
 
@@ -67,12 +92,14 @@ def bank(n: int) -> np.dtype[np.void]:
         ("e", "f4", BANK_COLUMNS),
         ("num", "f4", BANK_COLUMNS),
         ("den", "f4", BANK_COLUMNS),
+        ("heading_o", "f4", BANK_COLUMNS),  # responses through `haltere.filter.turning`, and what heading alone says of each
+        ("heading_d", "f4", BANK_COLUMNS),
+        ("heading_num", "f4", BANK_COLUMNS),
+        ("heading_den", "f4", BANK_COLUMNS),
+        ("track", _TRACK),
         ("live", "i8", int(SLOTS)),
         ("onset", "f8", int(SLOTS)),
-        ("q", "f8", (int(SLOTS), 4)),  # attitude and innovation of heading then
-        ("heading_then", "f8", int(SLOTS)),
-        ("heading", "f8"),  # innovation of heading lately, and when
-        ("t_heading", "f8"),
+        ("t_heading", "f8"),  # when heading was last heard
         ("phi", _TRANSITION),
         ("span", "f8"),
         ("last", "f8", 20),  # whitened innovation before, by component
@@ -104,6 +131,7 @@ def bank(n: int) -> np.dtype[np.void]:
         ("slope", "f8", 6),  # of a ramp that was named, by axis, until when
         ("t_slope", "f8", 6),
         ("healed", "i8"),
+        ("watched", "f8"),  # how long axes of the IMU were judged [s]
         ("t_unfit", "f8"),  # when what explains most last left too much unexplained
         ("t_doubt", "f8"),  # until when nothing is judged
         ("t_named", "f8", 14),  # by family: when it was last named, how often in a row, until when it is not named again
@@ -112,6 +140,8 @@ def bank(n: int) -> np.dtype[np.void]:
         ("aloft", "i8"),  # in the air; height down where it last rested, when; last contact
         ("floor", "f8"),
         ("t_rest", "f8"),
+        ("spacing", "f8"),  # how far IMU samples are apart on average, and how fast it rose or sank of late
+        ("sank", "f8"),
         ("t_contact", "f8"),
         ("t_turn", "f8"),  # of a compass that turns against the gyro: its onset, rate and duration when that was noticed
         ("turn_rate", "f8"),
