@@ -30,7 +30,7 @@ from haltere.estimators.local_filters import (
 )
 from haltere.filter.update import NONE
 from haltere.filter.windows import empty, take
-from haltere.strapdown.dynamics import ATTITUDE, OWN, PLACE, SPEED, carry, move, transition, transpose
+from haltere.strapdown.dynamics import ATTITUDE, BARO_OFFSET, MEAN, PLACE, SPEED, carry, move, transition, transpose
 from haltere.vehicle.linear import Linear
 
 __all__ = ["detect_external", "detect_inertial", "detect_of_the_imu", "reseed", "watch"]
@@ -52,21 +52,20 @@ def reseed(s: Any, prm: Any) -> None:
     c, a = x.chain, x.air
     for i in range(3):
         c.w[i], c.v[i], c.p[i], c.bm[i], c.bf[i] = x.w[i], x.v[i], x.p[i], x.bm[i], x.bf[i]
-        x.axis[i, 0], x.axis[i, 1] = x.w[i] + x.lf[0].own[i], 0.0
+        x.axis[i, 0], x.axis[i, 1] = x.w[i] + x.bg[i], 0.0
         sd = miss(s, prm, 3 + i)
         x.axis_P[i, 0], x.axis_P[i, 1], x.axis_P[i, 2] = 1e-3, 0.0, sd * sd if prm.fault_tolerant_biases > 0.0 else 0.0
-        a.x[i], x.held[0, i], x.held[1, i] = x.bf[i], x.lf[1].own[i], x.lf[1].own[i]
+        a.x[i], x.held[0, i], x.held[1, i] = x.bf[i], x.ba[i], x.ba[i]
     for i in range(4):
         c.q[i] = x.q[i]
     for i in range(2):
         c.wind[i], c.steady[i] = x.wind[i], x.steady[i]
         a.x[3 + i], a.x[5 + i] = x.wind[i], x.steady[i]
-    for i in range(25):
+    c.baro = x.baro
+    for i in range(23):
         c.dx[i] = 0.0
-        for j in range(25):
-            c.P[i, j] = x.P[i, j] if i < 22 and j < 22 else 0.0
-    c.baro = x.lf[4].own[0]
-    c.P[22, 22], c.P[23, 23], c.P[24, 24] = x.lf[4].P[22, 22], 1e-12, 1e-12
+        for j in range(23):
+            c.P[i, j] = x.P[i if i < 22 else BARO_OFFSET, j if j < 22 else BARO_OFFSET]
     for i in range(7):
         a.dx[i] = 0.0
         for j in range(7):
@@ -140,7 +139,7 @@ def detect_inertial(s: Any, prm: Any, lin: Linear, C: Mat, gyro: Vec, accel: Vec
     for i in range(3):
         P, sd = x.axis_P[i], miss(s, prm, 3 + i)
         w, b = x.axis[i, 0], x.axis[i, 1]
-        w += dt * (turned[i] + b + lin[5][i][i] * (w - x.w[i] - x.lf[0].own[i]))
+        w += dt * (turned[i] + b + lin[5][i][i] * (w - x.w[i] - x.bg[i]))
         b *= leak
         p00 = P[0] + dt * (2.0 * P[1] + dt * P[2]) + dt * swing_noise(s, prm, i)
         p01, p11 = leak * (P[1] + dt * P[2]), leak * leak * P[2]
@@ -189,7 +188,7 @@ def detect_inertial(s: Any, prm: Any, lin: Linear, C: Mat, gyro: Vec, accel: Vec
     if x.t - x.t_held > HELD and x.alarms == 0:
         x.t_held = x.t
         for i in range(3):
-            x.held[0, i], x.held[1, i] = x.held[1, i], x.lf[1].own[i]
+            x.held[0, i], x.held[1, i] = x.held[1, i], x.ba[i]
     for i in range(7):
         a.x[i] += a.dx[i]
         a.dx[i] = 0.0
@@ -242,11 +241,11 @@ def detect_external(s: Any, prm: Any, dt: float) -> None:
             r1 = prm.noise_barometer * prm.noise_barometer
             e = m.z[0] - s.origin[2] + c.p[2] - c.baro
             gate = 0.0 if x.isolated & (1 << 14) else prm.gate_barometer
-            e, S = scalar(c, ((PLACE, (0.0, 0.0, -1.0)), (OWN, (1.0, 0.0, 0.0)), NONE), e, r1, gate)
+            e, S = scalar(c, ((PLACE, (0.0, 0.0, -1.0)), (MEAN, (0.0, 0.0, 1.0)), NONE), e, r1, gate)
             slow(s, prm, BY_MODEL + 2, (e / math.sqrt(S), 0.0, 0.0), 1, m.t)
     correct(c, c.dx)
     c.baro += c.dx[22]
-    for i in range(25):
+    for i in range(23):
         c.dx[i] = 0.0
 
 

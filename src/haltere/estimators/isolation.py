@@ -64,7 +64,8 @@ def doubt(s: Any, i: int, variance: float) -> None:
     x = s.ft[0]
     x.P[i, i] += variance
     for k in range(LOCAL_FILTERS):
-        x.lf[k].P[i, i] += variance
+        if x.lf[k].share > 0.0:
+            x.lf[k].P[i, i] += variance / x.lf[k].share
 
 
 @jit
