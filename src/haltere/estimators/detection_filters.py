@@ -37,6 +37,8 @@ __all__ = ["detect_external", "detect_inertial", "detect_of_the_imu", "reseed", 
 
 #: Detection filters by number: J11, J14, J21, J31.
 FORCES, MOMENTS, BY_MODEL, BY_IMU = (constant(i) for i in (0, 3, 6, 10))
+#: J16, and the part of its level that tells a gyro from a compass when J31 alarms soon after: only these two are left then.
+TURNS, NEARLY = constant(5), 0.5
 #: The chains settle for so long after they begin [s], and the air near the ground counts for nothing [m].
 SETTLE, NEAR = 6.0, 1.5
 #: The accelerometer's bias that J11-J13 take off is as old as that, to twice that [s]: a fault shall not hide in it.
@@ -90,9 +92,11 @@ def judge(s: Any, prm: Any, detector: int, w: Any, t: float) -> None:
     statistic = w.snapshot if prm.fault_tolerant_detector > 0.0 else w.glr
     ratio = statistic / x.level[detector]
     x.last[detector] = ratio
-    if x.armed == 0 or x.off & (1 << detector):
+    if x.armed != 1 or x.off & (1 << detector):
         return
     x.most[detector] = max(x.most[detector], ratio)
+    if detector == TURNS and ratio > NEARLY:
+        x.t_jerked = t
     if ratio > 1.0:
         x.t_alarm = t
         if x.alarms == 0:
@@ -126,8 +130,11 @@ def watch(s: Any, prm: Any, t: float) -> None:
     x = s.ft[0]
     clear = x.ground - x.p[2] > NEAR
     if not clear:
-        x.t_chain = t  # contact and ground effect are no faults
-    x.armed = 1 if clear and t - x.t_chain > SETTLE else 0
+        x.armed = -1  # contact and ground effect are no faults
+        return
+    if x.armed < 0:
+        reseed(s, prm)
+    x.armed = 1 if t - x.t_chain > SETTLE else 0
 
 
 @jit
@@ -205,7 +212,7 @@ def detect_external(s: Any, prm: Any, dt: float) -> None:
     T = transition(C, (c.w[0], c.w[1], c.w[2]), force, v, lin[2], lin[3], lin[4], lin[5], dt, keep, leak)
     move(c, lin[0], lin[1], s.gravity, dt, keep, leak)
     carry(c, T)
-    add_noise(s, prm, c.P, C, dt, 1.0)
+    add_noise(s, prm, c.P, C, dt, 1.0, False)
     c.P[22, 22] += prm.noise_baro_bias * prm.noise_baro_bias * dt
     tilt = (
         C[2][0] * C[2][0] * (c.P[4, 4] + c.P[5, 5])
@@ -259,14 +266,15 @@ def detect_of_the_imu(s: Any, prm: Any, n: int) -> None:
         if h.reason == R_START or not h.innovation_sd > 0.0:
             continue
         z = h.innovation / h.innovation_sd
-        if h.component == C_HEADING:
+        place, speed = h.sensor == GNSS_POSITION, h.sensor == GNSS_VELOCITY  # not what was assumed for want of it
+        if h.sensor == MAGNETOMETER and h.component == C_HEADING:
             slow(s, prm, BY_IMU, (z, 0.0, 0.0), 1, h.t)
-        elif h.component == C_ALTITUDE:
+        elif h.sensor == BAROMETER and h.component == C_ALTITUDE:
             slow(s, prm, BY_IMU + 2, (z, 0.0, 0.0), 1, h.t)
-        elif h.component in (C_VEL, C_POS):
+        elif (speed and h.component == C_VEL) or (place and h.component == C_POS):
             z0, d = z, 1
-        elif h.component in (C_VEL + 1, C_POS + 1):
+        elif (speed and h.component == C_VEL + 1) or (place and h.component == C_POS + 1):
             z1, d = z, 2
-        elif d == 2 and h.component in (C_VEL + 2, C_POS + 2):
-            slow(s, prm, BY_IMU + (1 if h.component == C_VEL + 2 else 3), (z0, z1, z), 3, h.t)
+        elif d == 2 and ((speed and h.component == C_VEL + 2) or (place and h.component == C_POS + 2)):
+            slow(s, prm, BY_IMU + (1 if speed else 3), (z0, z1, z), 3, h.t)
             d = 0

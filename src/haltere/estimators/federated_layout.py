@@ -108,6 +108,7 @@ def federated() -> np.dtype[np.void]:
         ("size", "f8", 3),  # force that J11-J13 missed when they first alarmed [m/s^2]
         ("held", "f8", (2, 3)),  # accelerometer bias of some seconds ago, and of later
         ("t_held", "f8"),
+        ("t_jerked", "f8"),  # when J16 was last near an alarm
         ("t_compass", "f8"),  # when the compass watch last found another field
         ("named", "i8"),  # fault that the signatures of the IMU chain name, plus one
         ("t_first", "f8"),
@@ -117,6 +118,8 @@ def federated() -> np.dtype[np.void]:
         ("off", "i8"),  # detection filters that contain what is isolated
         ("isolated", "i8"),  # sensors' axes and model's axes that are isolated, a bit each
         ("t_isolated", "f8", 32),
+        ("missed", "f8", 6),  # sums of b_F and b_M since an axis of the model is isolated
+        ("n_missed", "i8", 6),
         ("n_findings", "i8"),
         ("finding", FINDING, (FINDINGS,)),
         ("exclude", "f8", (2, 4, 3)),  # gyro and accelerometer: axes, from, to

@@ -40,7 +40,10 @@ from haltere.strapdown.dynamics import (
 from haltere.vehicle.linear import Linear, linear
 from haltere.vehicle.regressors import model
 
-__all__ = ["add_noise", "compass_row", "evaluate", "fuse_sensors", "fusion", "linear_at", "predict_all", "scalar", "set_shares", "unit"]
+__all__ = [
+    "add_noise", "compass_row", "evaluate", "fuse_inertial", "fuse_sensors", "fusion", "gust", "left_over", "linear_at", "miss",
+    "predict_all", "scalar", "set_shares", "swing_noise", "unit",
+]  # fmt: skip
 
 #: How long what the model misses of force and moment lasts [s], and least 1 sigma of it [m/s^2, rad/s^2].
 MISS_TIME = 1.0
@@ -55,6 +58,8 @@ STILL = 1e-9
 FORCE_LEAST, MOMENT_LEAST = 0.05, 0.05
 #: An isolated axis of the model is left to the sensors: 1 sigma of what it may miss [m/s^2, rad/s^2].
 FORCE_FREE, MOMENT_FREE = 5.0, 30.0
+#: So is all of it that a sensor can tell below this height over where it stood [m]: what the ground does, no model here knows.
+LOW = 1.0
 
 
 @jit
@@ -149,16 +154,16 @@ def swing_noise(s: Any, prm: Any, a: int) -> float:
 
 
 @jit
-def add_noise(s: Any, prm: Any, P: Any, C: Mat, dt: float, share: float) -> None:
-    """Noise of the process over one interval, ``share`` (1/β) times: what the model misses, gusts, walks of sensors' biases not."""
+def add_noise(s: Any, prm: Any, P: Any, C: Mat, dt: float, share: float, low: bool) -> None:
+    """Noise of the process over one interval, ``share`` (1/β) times: what the model misses (near the ground ``low`` all), and gusts."""
     m, x = s.model[0], s.ft[0]
     k = share * dt
     blow = gust(s, prm)
     for i in range(3):
         moment, force = miss(s, prm, 3 + i), miss(s, prm, i)
-        if x.isolated & (1 << (6 + i)):
+        if (low and x.lf[LF_ACCEL].axes & (1 << i)) or x.isolated & (1 << (6 + i)):
             force = FORCE_FREE
-        if x.isolated & (1 << (9 + i)):
+        if (low and x.lf[LF_GYRO].axes & (1 << i)) or x.isolated & (1 << (9 + i)):
             moment = MOMENT_FREE
         P[i, i] += k * swing_noise(s, prm, i)
         P[3 + i, 3 + i] += k * 1e-9
@@ -203,7 +208,7 @@ def predict_all(s: Any, prm: Any, dt: float) -> tuple[Linear, Mat, Vec]:
         if f.share > 0.0:
             carry(f, T)
             carry_vector(f.dx, T)
-            add_noise(s, prm, f.P, C, dt, 1.0 / f.share)
+            add_noise(s, prm, f.P, C, dt, 1.0 / f.share, x.ground - x.p[2] < LOW)
             add_walks(prm, f.P, dt / f.share)
     return lin, C, v
 
