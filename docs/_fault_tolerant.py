@@ -54,22 +54,35 @@ WITHOUT: dict[str, dict[str, str]] = {
     "whole IMU": {"exclude.gyro": "xyz@20-80", "exclude.accel": "xyz@20-80"},
 }
 VERDICTS = ("bias", "suspect", "step")
+#: The IMU of the truth table (caption of theory.md §5.5): 0.005 rad/s and 0.15 m/s² a sample at 100 Hz, and no bias.
+QUIET = {**SENSORS, "imu": {"rate": 500.0, "gyro_noise": 5e-4, "accel_noise": 0.015, "gyro_turn_on": 0.0, "accel_turn_on": 0.0}}
+TOLD = {"noise.gyro": 5e-4, "noise.accel": 0.015}
+#: A fault that grows, what is left out from 35 s on.
+RAMPS = {
+    "accel.x, 0.1 m/s² a second": ("accel.x:ramp=0.1m/s2/s@25", {"exclude.accel": "x@35-60"}),
+    "gyro.x, 0.2 °/s a second": ("gyro.x:ramp=0.2deg/s/s@25", {"exclude.gyro": "x@35-60"}),
+    "gyro.z, 0.3 °/s a second": ("gyro.z:ramp=0.3deg/s/s@25", {"exclude.gyro": "z@35-60"}),
+}
 
 
-def flight(seed: int, mission: str, wind: str, duration: float, fault: tuple[str, ...] = (), scale: float = 0.6) -> FlightLog:
+def flight(
+    seed: int, mission: str, wind: str, duration: float, fault: tuple[str, ...] = (), scale: float = 0.6, quiet: bool = False
+) -> FlightLog:
     """A simulated flight of the Hummingbird with rotor speeds."""
-    return simulate(Scenario(mission=mission, duration=duration, seed=seed, wind=WINDS[wind], fault=fault, scale=scale, sensors=SENSORS))
+    sensors = QUIET if quiet else SENSORS
+    return simulate(Scenario(mission=mission, duration=duration, seed=seed, wind=WINDS[wind], fault=fault, scale=scale, sensors=sensors))
 
 
-def vehicle() -> Vehicle:
+def vehicle(quiet: bool = False) -> Vehicle:
     """What three other flights tell of it."""
     missions = ("lissajous", "box", "figure-eight")
-    return identify_vehicle([flight(901 + k, m, "still", 90.0, scale=1.0) for k, m in enumerate(missions)]).as_vehicle()
+    return identify_vehicle([flight(901 + k, m, "still", 90.0, scale=1.0, quiet=quiet) for k, m in enumerate(missions)]).as_vehicle()
 
 
-def verdict(log: FlightLog, of: Vehicle, preset: str) -> dict[str, Any]:
+def verdict(log: FlightLog, of: Vehicle, preset: str, told: dict[str, Any] | None = None) -> dict[str, Any]:
     """The first verdict after the fault, and whether there was one before."""
-    events = [e for e in haltere.run(log, "fault-tolerant", preset=preset, vehicle=of, scored=False).events if e["kind"] in VERDICTS]
+    s = haltere.run(log, "fault-tolerant", preset=preset, set=told or {}, vehicle=of, scored=False)
+    events = [e for e in s.events if e["kind"] in VERDICTS]
     later = [e for e in events if e["t_onset"] > START - 1.0]
     out: dict[str, Any] = {"before": len(events) - len(later), "said": None, "detected": None, "isolated": None}
     if later:
@@ -80,7 +93,7 @@ def verdict(log: FlightLog, of: Vehicle, preset: str) -> dict[str, Any]:
     return out
 
 
-def verdicts(of: Vehicle, preset: str, wind: str, missions: tuple[str, ...], seeds: int) -> dict[str, Any]:
+def verdicts(of: Vehicle, preset: str, wind: str, missions: tuple[str, ...], seeds: int, quiet: bool = False) -> dict[str, Any]:
     """Table of all faults."""
     rows: dict[str, Any] = {}
     for mission in missions:
@@ -88,7 +101,8 @@ def verdicts(of: Vehicle, preset: str, wind: str, missions: tuple[str, ...], see
             said: dict[str, int] = {}
             good, before, detected, isolated = 0, 0, [], []
             for k in range(seeds):
-                v = verdict(flight(50000 + k, mission, wind, 45.0, (f"{word}@{START:g}",)), of, preset)
+                log = flight(50000 + k, mission, wind, 45.0, (f"{word}@{START:g}",), quiet=quiet)
+                v = verdict(log, of, preset, TOLD if quiet else None)
                 key = "nothing" if v["said"] is None else " ".join(v["said"]) or "no signature"
                 said[key] = said.get(key, 0) + 1
                 good += v["said"] is not None and tuple(v["said"]) in right
@@ -103,10 +117,12 @@ def verdicts(of: Vehicle, preset: str, wind: str, missions: tuple[str, ...], see
     return rows
 
 
-def errors(log: FlightLog, of: Vehicle, without: dict[str, str]) -> tuple[float, float, float, float]:
+def errors(
+    log: FlightLog, of: Vehicle, without: dict[str, str], begin: float = 25.0, end: float = 80.0
+) -> tuple[float, float, float, float]:
     """RMS tilt, largest tilt, RMS yaw [deg] and RMS velocity, all axes [m/s], from 25 s to 80 s."""
     s = haltere.run(log, "fault-tolerant", set={"fault_tolerant.isolate": "off", **without}, vehicle=of, scored=False)
-    truth, use = log["truth"], (s.t >= 25.0) & (s.t <= 80.0)
+    truth, use = log["truth"], (s.t >= begin) & (s.t <= end)
     k = np.searchsorted(truth.t, s.t[use]).clip(0, len(truth.t) - 1)
     a, b = s.vector("q", "wxyz")[use], np.column_stack([truth[f"q_{c}"] for c in "wxyz"])[k]
     down = [np.column_stack([2 * (x * z - w * y), 2 * (y * z + w * x), w * w - x * x - y * y + z * z]) for w, x, y, z in (a.T, b.T)]
@@ -128,6 +144,19 @@ def navigation(of: Vehicle, seeds: int) -> dict[str, Any]:
             e = np.array([errors(log, of, without) for log in logs])
             rows[f"{wind}: {name}"] = {"flights": seeds, "median": np.median(e, axis=0).tolist(), "worst": e.max(axis=0).tolist()}
             print(wind, name, np.round(np.median(e, axis=0), 2), flush=True)
+    return rows
+
+
+def contained(of: Vehicle, seeds: int) -> dict[str, Any]:
+    """Tilt and heading [deg] in the second after a fault that grew for ten is left out, with and without resets: medians."""
+    rows: dict[str, Any] = {}
+    for name, (word, without) in RAMPS.items():
+        for reset in ("fusion", "none"):
+            keys = {"fault_tolerant.reset": reset, "diagnosis.inertial": "off", **without}
+            e = [errors(flight(51000 + k, "lissajous", "still", 60.0, (word,)), of, keys, 35.1, 36.1) for k in range(seeds)]
+            m = np.median(np.array(e), axis=0)
+            rows[f"{name}: {reset}"] = {"flights": seeds, "tilt": float(m[0]), "heading": float(m[2])}
+            print(name, reset, rows[f"{name}: {reset}"], flush=True)
     return rows
 
 
@@ -163,11 +192,21 @@ def main() -> None:
             "# Made by vehicle() of docs/_fault_tolerant.py, on three simulated flights.\n" + vehicle().to_toml(), encoding="utf-8"
         )
     of = load_vehicle(kept)
+    kept = a.out.with_name("hummingbird_quiet.toml")
+    if not kept.exists():
+        kept.write_text(
+            "# Made by vehicle(quiet=True) of docs/_fault_tolerant.py, on three simulated flights with the IMU of theory.md §5.5.\n"
+            + vehicle(quiet=True).to_toml(),
+            encoding="utf-8",
+        )
+    quiet = load_vehicle(kept)
     out: dict[str, Any] = {}
     for name, part in {
         "navigation": lambda: navigation(of, a.flights),
         "default, still air": lambda: verdicts(of, "default", "still", ("hover", "box"), a.seeds),
         "default, gusts": lambda: verdicts(of, "default", "gusts", ("box",), a.seeds),
+        "as-corrected, still air": lambda: verdicts(quiet, "as-corrected", "still", ("lissajous",), a.seeds, quiet=True),
+        "resets": lambda: contained(of, a.seeds),
         "false alarms": lambda: false_alarms(of, a.clean),
     }.items():
         out[name] = part()

@@ -164,7 +164,7 @@ def test_transition_is_the_derivative_of_the_motion(seed: int) -> None:
 @pytest.mark.parametrize("seed", range(3))
 def test_covariance_is_carried_as_by_the_matrix(seed: int) -> None:
     rng = np.random.default_rng(seed)
-    S = as_records(np.zeros(1, np.dtype((np.record, [("P", "f8", (25, 25)), ("alone", "i8")]))))
+    S = as_records(np.zeros(1, np.dtype((np.record, [("alone", "i8"), ("P", "f8", (25, 25))]))))
     root = rng.normal(size=(25, 25))
     S["P"][0] = root @ root.T
     T = _transition(_state(seed), vehicle(), 0.01, 0.99)

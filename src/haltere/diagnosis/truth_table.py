@@ -40,6 +40,8 @@ _TABLE: tuple[tuple[str, str, str], ...] = (
 AIR = constant(_BIT["J11"] | _BIT["J12"])
 FAULTS = tuple(row[0] for row in _TABLE)
 N_FAULTS = constant(len(FAULTS))
+#: The first of them are faults of gyro and accelerometer.
+INERTIAL = 6
 MUST = tuple(constant(sum(_BIT[name] for name in row[1].split())) for row in _TABLE)
 MAY = tuple(constant(sum(_BIT[name] for name in row[2].split())) for row in _TABLE)
 
@@ -63,12 +65,16 @@ def match(alarms: int, blind: int) -> tuple[int, int]:
     alarms
         Detection filters that alarmed, a bit each.
     blind
-        Filters whose silence says nothing.
+        Filters whose silence says nothing of a fault of the IMU. What another sensor's fault does to a residual is there at once.
     """
     best, least = 0, 99
     for f in range(N_FAULTS):
-        wrong = count(MUST[f] & ~alarms & ~blind) + count(alarms & ~(MUST[f] | MAY[f]))
-        if (MUST[f] if MUST[f] != 0 else AIR) & alarms == 0:
+        unheard = blind if f < INERTIAL else 0
+        wrong = count(MUST[f] & ~alarms & ~unheard) + count(alarms & ~(MUST[f] | MAY[f]))
+        some = MUST[f] if MUST[f] != 0 else AIR
+        if some & ~unheard == 0:
+            some |= MAY[f] & ~unheard
+        if some & alarms == 0:
             continue
         if wrong < least:
             best, least = 1 << f, wrong

@@ -76,9 +76,7 @@ class State:
 
     def _vector(self, name: str) -> FloatArray:
         if self._federated:
-            x = self.record["ft"][0, 0]
-            own = {"bg": 0, "ba": 1}.get(name)
-            return np.array(x[name] if own is None else x["lf"][own]["own"], dtype=np.float64)
+            return np.array(self.record["ft"][0, 0][name], dtype=np.float64)
         return np.array(self.record[name][0], dtype=np.float64)
 
     @property
@@ -115,11 +113,9 @@ class State:
     @property
     def P(self) -> FloatArray:
         """Covariance of the error state: attitude (body), velocity, position, gyro bias, accelerometer bias, optional blocks."""
-        if self._federated:  # attitude, velocity, position; biases are of local filters
-            x, P = self.record["ft"][0, 0], np.zeros((15, 15))
-            P[:9, :9] = x["P"][3:12, 3:12]
-            P[9:12, 9:12], P[12:, 12:] = x["lf"][0]["P"][22:, 22:], x["lf"][1]["P"][22:, 22:]
-            return P
+        if self._federated:  # attitude, velocity, position, and the biases behind what only this filter has
+            core = np.r_[3:12, 22:28]
+            return np.array(self.record["ft"][0, 0]["P"][np.ix_(core, core)], dtype=np.float64)
         return self._vector("P")
 
 

@@ -30,13 +30,15 @@ from haltere.estimators.local_filters import (
 )
 from haltere.filter.update import NONE
 from haltere.filter.windows import empty, take
-from haltere.strapdown.dynamics import ATTITUDE, OWN, PLACE, SPEED, carry, move, transition, transpose
+from haltere.strapdown.dynamics import ATTITUDE, BARO_OFFSET, MEAN, PLACE, SPEED, carry, move, transition, transpose
 from haltere.vehicle.linear import Linear
 
 __all__ = ["detect_external", "detect_inertial", "detect_of_the_imu", "reseed", "watch"]
 
 #: Detection filters by number: J11, J14, J21, J31.
 FORCES, MOMENTS, BY_MODEL, BY_IMU = (constant(i) for i in (0, 3, 6, 10))
+#: J16, and the part of its level that tells a gyro from a compass when J31 alarms soon after: only these two are left then.
+TURNS, NEARLY = constant(5), 0.5
 #: The chains settle for so long after they begin [s], and the air near the ground counts for nothing [m].
 SETTLE, NEAR = 6.0, 1.5
 #: The accelerometer's bias that J11-J13 take off is as old as that, to twice that [s]: a fault shall not hide in it.
@@ -52,21 +54,20 @@ def reseed(s: Any, prm: Any) -> None:
     c, a = x.chain, x.air
     for i in range(3):
         c.w[i], c.v[i], c.p[i], c.bm[i], c.bf[i] = x.w[i], x.v[i], x.p[i], x.bm[i], x.bf[i]
-        x.axis[i, 0], x.axis[i, 1] = x.w[i] + x.lf[0].own[i], 0.0
+        x.axis[i, 0], x.axis[i, 1] = x.w[i] + x.bg[i], 0.0
         sd = miss(s, prm, 3 + i)
         x.axis_P[i, 0], x.axis_P[i, 1], x.axis_P[i, 2] = 1e-3, 0.0, sd * sd if prm.fault_tolerant_biases > 0.0 else 0.0
-        a.x[i], x.held[0, i], x.held[1, i] = x.bf[i], x.lf[1].own[i], x.lf[1].own[i]
+        a.x[i], x.held[0, i], x.held[1, i] = x.bf[i], x.ba[i], x.ba[i]
     for i in range(4):
         c.q[i] = x.q[i]
     for i in range(2):
         c.wind[i], c.steady[i] = x.wind[i], x.steady[i]
         a.x[3 + i], a.x[5 + i] = x.wind[i], x.steady[i]
-    for i in range(25):
+    c.baro = x.baro
+    for i in range(23):
         c.dx[i] = 0.0
-        for j in range(25):
-            c.P[i, j] = x.P[i, j] if i < 22 and j < 22 else 0.0
-    c.baro = x.lf[4].own[0]
-    c.P[22, 22], c.P[23, 23], c.P[24, 24] = x.lf[4].P[22, 22], 1e-12, 1e-12
+        for j in range(23):
+            c.P[i, j] = x.P[i if i < 22 else BARO_OFFSET, j if j < 22 else BARO_OFFSET]
     for i in range(7):
         a.dx[i] = 0.0
         for j in range(7):
@@ -91,9 +92,11 @@ def judge(s: Any, prm: Any, detector: int, w: Any, t: float) -> None:
     statistic = w.snapshot if prm.fault_tolerant_detector > 0.0 else w.glr
     ratio = statistic / x.level[detector]
     x.last[detector] = ratio
-    if x.armed == 0 or x.off & (1 << detector):
+    if x.armed != 1 or x.off & (1 << detector):
         return
     x.most[detector] = max(x.most[detector], ratio)
+    if detector == TURNS and ratio > NEARLY:
+        x.t_jerked = t
     if ratio > 1.0:
         x.t_alarm = t
         if x.alarms == 0:
@@ -127,8 +130,11 @@ def watch(s: Any, prm: Any, t: float) -> None:
     x = s.ft[0]
     clear = x.ground - x.p[2] > NEAR
     if not clear:
-        x.t_chain = t  # contact and ground effect are no faults
-    x.armed = 1 if clear and t - x.t_chain > SETTLE else 0
+        x.armed = -1  # contact and ground effect are no faults
+        return
+    if x.armed < 0:
+        reseed(s, prm)
+    x.armed = 1 if t - x.t_chain > SETTLE else 0
 
 
 @jit
@@ -140,7 +146,7 @@ def detect_inertial(s: Any, prm: Any, lin: Linear, C: Mat, gyro: Vec, accel: Vec
     for i in range(3):
         P, sd = x.axis_P[i], miss(s, prm, 3 + i)
         w, b = x.axis[i, 0], x.axis[i, 1]
-        w += dt * (turned[i] + b + lin[5][i][i] * (w - x.w[i] - x.lf[0].own[i]))
+        w += dt * (turned[i] + b + lin[5][i][i] * (w - x.w[i] - x.bg[i]))
         b *= leak
         p00 = P[0] + dt * (2.0 * P[1] + dt * P[2]) + dt * swing_noise(s, prm, i)
         p01, p11 = leak * (P[1] + dt * P[2]), leak * leak * P[2]
@@ -189,7 +195,7 @@ def detect_inertial(s: Any, prm: Any, lin: Linear, C: Mat, gyro: Vec, accel: Vec
     if x.t - x.t_held > HELD and x.alarms == 0:
         x.t_held = x.t
         for i in range(3):
-            x.held[0, i], x.held[1, i] = x.held[1, i], x.lf[1].own[i]
+            x.held[0, i], x.held[1, i] = x.held[1, i], x.ba[i]
     for i in range(7):
         a.x[i] += a.dx[i]
         a.dx[i] = 0.0
@@ -206,7 +212,7 @@ def detect_external(s: Any, prm: Any, dt: float) -> None:
     T = transition(C, (c.w[0], c.w[1], c.w[2]), force, v, lin[2], lin[3], lin[4], lin[5], dt, keep, leak)
     move(c, lin[0], lin[1], s.gravity, dt, keep, leak)
     carry(c, T)
-    add_noise(s, prm, c.P, C, dt, 1.0)
+    add_noise(s, prm, c.P, C, dt, 1.0, False)
     c.P[22, 22] += prm.noise_baro_bias * prm.noise_baro_bias * dt
     tilt = (
         C[2][0] * C[2][0] * (c.P[4, 4] + c.P[5, 5])
@@ -242,11 +248,11 @@ def detect_external(s: Any, prm: Any, dt: float) -> None:
             r1 = prm.noise_barometer * prm.noise_barometer
             e = m.z[0] - s.origin[2] + c.p[2] - c.baro
             gate = 0.0 if x.isolated & (1 << 14) else prm.gate_barometer
-            e, S = scalar(c, ((PLACE, (0.0, 0.0, -1.0)), (OWN, (1.0, 0.0, 0.0)), NONE), e, r1, gate)
+            e, S = scalar(c, ((PLACE, (0.0, 0.0, -1.0)), (MEAN, (0.0, 0.0, 1.0)), NONE), e, r1, gate)
             slow(s, prm, BY_MODEL + 2, (e / math.sqrt(S), 0.0, 0.0), 1, m.t)
     correct(c, c.dx)
     c.baro += c.dx[22]
-    for i in range(25):
+    for i in range(23):
         c.dx[i] = 0.0
 
 
@@ -260,14 +266,15 @@ def detect_of_the_imu(s: Any, prm: Any, n: int) -> None:
         if h.reason == R_START or not h.innovation_sd > 0.0:
             continue
         z = h.innovation / h.innovation_sd
-        if h.component == C_HEADING:
+        place, speed = h.sensor == GNSS_POSITION, h.sensor == GNSS_VELOCITY  # not what was assumed for want of it
+        if h.sensor == MAGNETOMETER and h.component == C_HEADING:
             slow(s, prm, BY_IMU, (z, 0.0, 0.0), 1, h.t)
-        elif h.component == C_ALTITUDE:
+        elif h.sensor == BAROMETER and h.component == C_ALTITUDE:
             slow(s, prm, BY_IMU + 2, (z, 0.0, 0.0), 1, h.t)
-        elif h.component in (C_VEL, C_POS):
+        elif (speed and h.component == C_VEL) or (place and h.component == C_POS):
             z0, d = z, 1
-        elif h.component in (C_VEL + 1, C_POS + 1):
+        elif (speed and h.component == C_VEL + 1) or (place and h.component == C_POS + 1):
             z1, d = z, 2
-        elif d == 2 and h.component in (C_VEL + 2, C_POS + 2):
-            slow(s, prm, BY_IMU + (1 if h.component == C_VEL + 2 else 3), (z0, z1, z), 3, h.t)
+        elif d == 2 and ((speed and h.component == C_VEL + 2) or (place and h.component == C_POS + 2)):
+            slow(s, prm, BY_IMU + (1 if speed else 3), (z0, z1, z), 3, h.t)
             d = 0

@@ -11,6 +11,7 @@ from haltere.flight.config import Config
 __all__ = ["COLOUR", "COLOUR_SNAPSHOT", "COMPONENTS", "SAMPLES", "detection_levels"]
 
 FloatArray = NDArray[np.float64]
+J21, J31 = 6, 10
 
 #: Components of the residual of each detection filter, in the order of `haltere.diagnosis.truth_table.DETECTORS`.
 COMPONENTS = (1, 1, 1, 1, 1, 1, 1, 3, 1, 3, 1, 3, 1, 3)
@@ -31,5 +32,8 @@ def detection_levels(config: Config) -> tuple[FloatArray, FloatArray]:
     rate = config.number("diagnosis.false_alarms")
     if config["fault_tolerant.detector"] == "snapshot":
         plain = [sample_level(rate / (3600.0 * total), d) for d in COMPONENTS]
-        return np.array(plain) * COLOUR_SNAPSHOT, np.zeros(14)
+        colour = COLOUR_SNAPSHOT.copy()
+        if config.number("noise.field") == 0.0:
+            colour[J31] = colour[J21]  # its residuals have no more than their own noise then, as those of J21
+        return np.array(plain) * colour, np.zeros(14)
     return np.array([glr_level(rate, total, d) for d in COMPONENTS]) * COLOUR, np.zeros(14)

@@ -5,7 +5,7 @@ barometer each have a local filter, and a federated filter fuses these (`haltere
 the model, the IMU and the other sensors in pairs; what fails is named by the pattern of their alarms and left out (`haltere.diagnosis`).
 
 It needs a vehicle file with ``[lumped]`` (``haltere identify``) and rotor speeds. Wind and biases are states, and detectors have many
-windows. The printed thresholds of the source are lost, so there is no ``as-printed``; the source put right, ``as-corrected``, is to come.
+windows; ``as-corrected`` has neither wind nor windows. The printed thresholds of the source are lost, so there is no ``as-printed``.
 """
 
 from __future__ import annotations

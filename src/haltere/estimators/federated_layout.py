@@ -9,6 +9,7 @@ import numpy as np
 from haltere._jit import constant
 from haltere.aids.record import AID_RECORD
 from haltere.filter.windows import windows
+from haltere.strapdown.dynamics import MOVING, STATES
 
 __all__ = [
     "DUE", "FAST", "FAST_WINDOW", "FEDERATED", "FINDINGS", "LF_ACCEL", "LF_BARO", "LF_GNSS", "LF_GYRO", "LF_MAG", "LOCAL_FILTERS",
@@ -26,6 +27,7 @@ FAST, SLOW = constant(6), constant(8)
 FAST_WINDOW, SLOW_WINDOW = 1024, 256
 #: Measurements between two steps, and findings, that there is room for.
 DUE, FINDINGS = 64, 32
+_N = int(STATES)
 
 
 def _record(*fields: tuple[object, ...]) -> np.dtype[np.void]:
@@ -37,13 +39,19 @@ _NOMINAL: tuple[tuple[object, ...], ...] = (
     ("w", "f8", 3), ("q", "f8", 4), ("v", "f8", 3), ("p", "f8", 3), ("bm", "f8", 3), ("bf", "f8", 3), ("wind", "f8", 2),
     ("steady", "f8", 2),
 )  # fmt: skip
-_UPDATED: tuple[tuple[object, ...], ...] = (("P", "f8", (25, 25)), ("dx", "f8", 25), ("u", "f8", 25), ("k", "f8", 25))
-#: A local filter: its correction ``dx`` is about the fused nominal state; its own states are a sensor's bias.
-LOCAL = _record(*_UPDATED, ("own", "f8", 3), ("gain", "f8", (3, 22)), ("axes", "i8"), ("t_back", "f8", 3))
+
+
+def _updated(n: int) -> tuple[tuple[object, ...], ...]:
+    """What `haltere.filter.update` needs of a filter of n states."""
+    return (("P", "f8", (n, n)), ("dx", "f8", n), ("u", "f8", n), ("k", "f8", n))
+
+
+#: A local filter: its correction ``dx`` is about the fused nominal state, ``axes`` what it hears, ``share`` its β, 0 where it has none.
+LOCAL = _record(("axes", "i8"), ("share", "f8"), ("changed", "i8"), *_updated(_N))
 #: The model's own chain, which hears compass, GNSS and barometer but no IMU (J21-J24).
-CHAIN = _record(*_NOMINAL, *_UPDATED, ("baro", "f8"))
+CHAIN = _record(*_NOMINAL, *_updated(int(MOVING) + 1), ("baro", "f8"))
 #: Force of the model against the accelerometer (J11-J13): what the model misses, wind and its mean.
-AIR_CHAIN = _record(("x", "f8", 7), ("P", "f8", (7, 7)), ("dx", "f8", 7), ("u", "f8", 7), ("k", "f8", 7))
+AIR_CHAIN = _record(("x", "f8", 7), *_updated(7))
 #: A measurement that waits for the next step.
 _DUE = _record(("kind", "i8"), ("t", "f8"), ("z", "f8", 3), ("r", "f8", 3))
 #: What a verdict rests on: when each detection filter first alarmed (0: did not), and the largest statistic over its level.
@@ -57,12 +65,15 @@ def federated() -> np.dtype[np.void]:
         ("on", "i8"),  # 1: the fused state is that of the vehicle's physics; 0: on the ground, or rotors not known
         ("t", "f8"),
         *_NOMINAL,
+        ("bg", "f8", 3),  # biases of gyro and accelerometer, offset of the barometer
+        ("ba", "f8", 3),
+        ("baro", "f8"),
         ("f", "f8", 3),  # force and angular acceleration of the model at the state, without b_F and b_M
         ("a", "f8", 3),
-        ("P", "f8", (22, 22)),
-        ("dx", "f8", 22),
-        ("y", "f8", 22),
-        ("work", "f8", (22, 22)),
+        ("P", "f8", (_N, _N)),
+        ("dx", "f8", _N),
+        ("y", "f8", _N),
+        ("work", "f8", (_N, _N)),
         ("lf", LOCAL, (int(LOCAL_FILTERS),)),
         ("t_fuse", "f8"),
         ("n_fused", "i8"),
@@ -97,6 +108,7 @@ def federated() -> np.dtype[np.void]:
         ("size", "f8", 3),  # force that J11-J13 missed when they first alarmed [m/s^2]
         ("held", "f8", (2, 3)),  # accelerometer bias of some seconds ago, and of later
         ("t_held", "f8"),
+        ("t_jerked", "f8"),  # when J16 was last near an alarm
         ("t_compass", "f8"),  # when the compass watch last found another field
         ("named", "i8"),  # fault that the signatures of the IMU chain name, plus one
         ("t_first", "f8"),
@@ -106,6 +118,8 @@ def federated() -> np.dtype[np.void]:
         ("off", "i8"),  # detection filters that contain what is isolated
         ("isolated", "i8"),  # sensors' axes and model's axes that are isolated, a bit each
         ("t_isolated", "f8", 32),
+        ("missed", "f8", 6),  # sums of b_F and b_M since an axis of the model is isolated
+        ("n_missed", "i8", 6),
         ("n_findings", "i8"),
         ("finding", FINDING, (FINDINGS,)),
         ("exclude", "f8", (2, 4, 3)),  # gyro and accelerometer: axes, from, to

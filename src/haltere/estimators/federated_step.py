@@ -168,12 +168,12 @@ def go_on(s: Any, prm: Any, t: float, dt: float, w1: Vec, f1: Vec, n_heard: int)
     detect_inertial(s, prm, lin, C, gyro, accel, turned, span)
     detect_external(s, prm, span)
     decide(s, prm, t)
+    set_axes(s, prm, t)
     fuse_inertial(s, prm, lin, C, v, gyro, accel, span)
     fuse_sensors(s, prm, C)
     x.n_due = 0
     if t >= x.t_fuse:
         x.t_fuse = max(x.t_fuse + 1.0 / prm.fault_tolerant_fuse_rate, t)
-        set_axes(s, prm, t)
         fusion(s, prm)
         evaluate(s, prm)
 
@@ -192,17 +192,16 @@ def write_row(s: Any, rows: Any) -> None:
         row[o + j] = math.nan
     if x.on == 0:
         return
-    g, h = x.lf[0], x.lf[1]
     for j in range(4):
         row[1 + j] = x.q[j]
     for j in range(3):
-        row[5 + j], row[8 + j], row[11 + j], row[14 + j] = x.v[j], x.p[j], g.own[j], h.own[j]
+        row[5 + j], row[8 + j], row[11 + j], row[14 + j] = x.v[j], x.p[j], x.bg[j], x.ba[j]
         row[23 + j], row[26 + j] = x.P[6 + j, 6 + j], x.P[9 + j, 9 + j]
-        row[29 + j], row[32 + j] = g.P[22 + j, 22 + j], h.P[22 + j, 22 + j]
+        row[29 + j], row[32 + j] = x.P[22 + j, 22 + j], x.P[25 + j, 25 + j]
     row[17], row[18], row[19] = x.P[3, 3], x.P[3, 4], x.P[3, 5]
     row[20], row[21], row[22] = x.P[4, 4], x.P[4, 5], x.P[5, 5]
     if len(s.baro) > 0:
-        row[35], row[35 + s.P.shape[0] - 15] = x.lf[4].own[0], x.lf[4].P[22, 22]
+        row[35], row[35 + s.P.shape[0] - 15] = x.baro, x.P[28, 28]
     row[o], row[o + 1], row[o + 2], row[o + 3] = x.wind[0], x.wind[1], x.P[18, 18], x.P[19, 19]
 
 
@@ -222,12 +221,10 @@ def write_covariance(s: Any, prm: Any, cov: Any) -> None:
     for b in range(5):
         for r in range(3):
             for c in range(r, 3):
-                if b < 3:
-                    cov[k, i] = x.P[3 + 3 * b + r, 3 + 3 * b + c]
-                else:
-                    cov[k, i] = x.lf[b - 3].P[22 + r, 22 + c]
+                o = 3 + 3 * b if b < 3 else 13 + 3 * b  # attitude, velocity, position; biases
+                cov[k, i] = x.P[o + r, o + c]
                 k += 1
-    cov[k, i] = x.lf[4].P[22, 22]
+    cov[k, i] = x.P[28, 28]
     cov[32, i], cov[33, i], cov[35, i] = x.P[18, 18], x.P[18, 19], x.P[19, 19]
 
 

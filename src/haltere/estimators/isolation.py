@@ -14,6 +14,7 @@ from haltere.aids.record import E_ISOLATED, E_READMITTED, E_UNDECIDED, NO_SENSOR
 from haltere.diagnosis.truth_table import MAY, MUST, N_FAULTS, count, match
 from haltere.estimators.detection_filters import reseed
 from haltere.estimators.federated_layout import FINDINGS, LOCAL_FILTERS, N_DETECTORS
+from haltere.estimators.local_filters import miss
 from haltere.filter.signatures import SLOTS
 
 __all__ = ["decide"]
@@ -24,9 +25,11 @@ GYRO, ACCEL, MODEL, COMPASS, VELOCITY, BARO, POSITION, ROTOR, WIND = (constant(i
 SETTLED = 0.4
 #: What a fault may have done to the fused state until it was named, 1 sigma: attitude [rad], velocity [m/s], height [m], wind [m/s].
 TURNED, PUSHED, LIFTED, BLOWN = math.radians(3.0), 0.5, 1.0, 4.0
+#: An axis of the model is right again where in the mean it misses less than so many times 1 sigma of what identification left for seconds.
+USUAL = 3.0
 #: Gyro z and compass are told apart within so many times ``fault_tolerant.wait``.
 DRIFT = 1.6
-J16, J31 = constant(1 << 5), constant(1 << 10)
+J31 = constant(1 << 10)
 #: Bits of the detection filters that hear a sensor: of the IMU chain, of the model's chain, of both by what they hear.
 BY_IMU, BY_MODEL = constant(0b1111 << 10), constant(0b1111 << 6)
 
@@ -64,7 +67,8 @@ def doubt(s: Any, i: int, variance: float) -> None:
     x = s.ft[0]
     x.P[i, i] += variance
     for k in range(LOCAL_FILTERS):
-        x.lf[k].P[i, i] += variance
+        if x.lf[k].share > 0.0:
+            x.lf[k].P[i, i] += variance / x.lf[k].share
 
 
 @jit
@@ -78,6 +82,8 @@ def leave_out(s: Any, prm: Any, fault: int, t: float) -> None:
         for k in range(16):
             if parts & (1 << k):
                 x.t_isolated[k] = t
+                if k >= MODEL and k < COMPASS:
+                    x.missed[k - MODEL], x.n_missed[k - MODEL] = 0.0, 0
     for i in range(3):
         if parts & (0b111 | (0b111 << 9)):
             doubt(s, 3 + i, TURNED * TURNED)
@@ -160,11 +166,12 @@ def powerless(s: Any, prm: Any, t: float) -> int:
     """Detection filters whose silence says nothing yet: those of the IMU chain, where a model's force alarms (theory-amendments.md 3).
 
     With the signatures of `haltere.filter.signatures`, an accelerometer fault of the size b that J11-J13 saw would be found by now with
-    probability 99 % where b² D ≥ (√h + 2.33)², D the information on it. Without them nothing is known of the power.
+    probability 99 % where b² D ≥ (√h + 2.33)², D the information on it. Without them nothing is known of the power, and of single
+    residuals it is small: the chain's tilt swallows a force, and its innovations fade (theory.md §5.4(b)).
     """
     x = s.ft[0]
     if len(s.bank) == 0:
-        return 0
+        return int(BY_IMU)
     b = s.bank[0]
     for a in range(3):
         if x.alarms & (1 << a):
@@ -201,10 +208,11 @@ def decide(s: Any, prm: Any, t: float) -> None:
     candidates = 0
     if fault < 0 and len(s.bank) > 0 and x.alarms & ~(MUST[GYRO + 2] | MAY[GYRO + 2]) == 0 and x.alarms & J31:
         # a gyro that drifts, or a compass: the model alone holds heading too badly for J21 to tell; a field of another size does
-        if t - x.t_first < DRIFT * prm.fault_tolerant_wait:
+        jerked = x.t_jerked > x.t_first - prm.fault_tolerant_wait
+        if t - x.t_first < (SETTLED if jerked else DRIFT * prm.fault_tolerant_wait):
             return
         candidates = (1 << (GYRO + 2)) | (1 << COMPASS)
-        if x.alarms & J16:
+        if jerked:
             fault = GYRO + 2
         elif x.t_compass > x.t_first - 1.0:
             fault = COMPASS
@@ -212,9 +220,13 @@ def decide(s: Any, prm: Any, t: float) -> None:
         if t - x.t_first < prm.fault_tolerant_wait:
             return
         blind = powerless(s, prm, t)
-        if blind != 0 and t - x.t_first < 2.0 * prm.fault_tolerant_wait:
+        if blind != 0 and len(s.bank) > 0 and t - x.t_first < 2.0 * prm.fault_tolerant_wait:
             return
         candidates, wrong = match(x.alarms, blind)
+        if prm.fault_tolerant_detector > 0.0 and wrong > 0:
+            candidates = 0  # the source's table has no nearest
+        if prm.fault_tolerant_wind == 0.0:
+            candidates &= ~(1 << WIND)  # without a state of it, its steps are not among what is known
         if count(candidates) > 1 and len(s.bank) > 0 and t - x.t_first < 2.0 * prm.fault_tolerant_wait and candidates & 0b111111:
             return  # the IMU chain's signatures may yet tell them apart
         if count(candidates) == 1 and wrong <= 1:
@@ -231,20 +243,53 @@ def decide(s: Any, prm: Any, t: float) -> None:
 
 
 @jit
+def heard_again(s: Any, prm: Any, t: float, k: int) -> bool:
+    """Whether a sensor (of an axis, for gyro and accelerometer) has agreed for ``fault_tolerant.recover``.
+
+    Its own detection filter has been quiet, and for the IMU those of its chain too: J14 to J16 do not see a rate that stays wrong.
+    """
+    x = s.ft[0]
+    loud = x.last[3 + k if k < 3 else k - 3 if k < 6 else k - 6] > 1.0
+    if k < 6:
+        for i in range(10, N_DETECTORS):
+            loud = loud or x.last[i] > 1.0
+    if loud:
+        x.t_isolated[k] = t
+    return bool(t - x.t_isolated[k] > prm.fault_tolerant_recover)
+
+
+@jit
+def right_again(s: Any, prm: Any, t: float, k: int) -> bool:
+    """Whether an axis of the model (bit 6 to 11) has been right for ``fault_tolerant.recover``: the mean of what it missed is as usual.
+
+    While it is isolated the sensors tell what it misses, b_F or b_M; a mean of that over seconds is known well.
+    """
+    x, a = s.ft[0], k - 6
+    x.missed[a] += x.bf[a] if a < 3 else x.bm[a - 3]
+    x.n_missed[a] += 1
+    if t - x.t_isolated[k] < prm.fault_tolerant_recover:
+        return False
+    mean = abs(x.missed[a]) / x.n_missed[a]
+    x.missed[a], x.n_missed[a], x.t_isolated[k] = 0.0, 0, t
+    return bool(mean < USUAL * miss(s, prm, a))
+
+
+@jit
 def readmit(s: Any, prm: Any, t: float) -> None:
-    """A sensor whose detection filter has been quiet for ``fault_tolerant.recover`` is heard again, its bias open; a model axis is not."""
+    """Hear again what has been right for a while: a sensor with its bias open, an axis of the model with what it misses as usual."""
     x = s.ft[0]
     if x.isolated == 0:
         return
     for k in range(16):
-        if x.isolated & (1 << k) == 0 or (k >= 6 and k < 12):
+        if x.isolated & (1 << k) == 0:
             continue
-        detector = 3 + k if k < 3 else k - 3 if k < 6 else k - 6
-        if x.last[detector] > 1.0:
-            x.t_isolated[k] = t
-        elif t - x.t_isolated[k] > prm.fault_tolerant_recover:
+        model = k >= MODEL and k < COMPASS
+        if right_again(s, prm, t, k) if model else heard_again(s, prm, t, k):
             x.isolated &= ~(1 << k)
             x.off = filters_of(x.isolated)
+            pending = x.t_first
             x.t_first = t
             tell(s, E_READMITTED, t, k, 1 << k)
-            x.t_first = 0.0
+            x.t_first = pending
+            if model:
+                reseed(s, prm)

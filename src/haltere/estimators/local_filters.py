@@ -20,12 +20,15 @@ from haltere.estimators.federated_layout import LF_ACCEL, LF_BARO, LF_GNSS, LF_G
 from haltere.filter.federated import add_information, fused, keep_apart, share_out
 from haltere.filter.update import NONE, apply, column_of, innovation, project, variance
 from haltere.strapdown.dynamics import (
+    ACCEL_BIAS,
     ATTITUDE,
+    BARO_OFFSET,
     FORCE,
-    OWN,
+    GYRO_BIAS,
     PLACE,
     RATE,
     SPEED,
+    STATES,
     WIND,
     air_velocity,
     carry,
@@ -37,7 +40,10 @@ from haltere.strapdown.dynamics import (
 from haltere.vehicle.linear import Linear, linear
 from haltere.vehicle.regressors import model
 
-__all__ = ["add_noise", "alive", "compass_row", "evaluate", "fuse_sensors", "fusion", "linear_at", "predict_all", "scalar", "unit"]
+__all__ = [
+    "add_noise", "compass_row", "evaluate", "fuse_inertial", "fuse_sensors", "fusion", "gust", "left_over", "linear_at", "miss",
+    "predict_all", "scalar", "set_shares", "swing_noise", "unit",
+]  # fmt: skip
 
 #: How long what the model misses of force and moment lasts [s], and least 1 sigma of it [m/s^2, rad/s^2].
 MISS_TIME = 1.0
@@ -45,35 +51,35 @@ MISS_TIME = 1.0
 LEAST_LEFT = 0.1
 #: What an angular acceleration is off by, as a part of it.
 RELATIVE = 0.3
-#: Shares of the fused information.
+#: Shares of the fused information, over those that have any.
 SHARES = (0.5, 0.4, 0.034, 0.033, 0.033)
+#: Spectral density of a wind that is no state, for its variance not to vanish [m^2/s^3].
+STILL = 1e-9
 FORCE_LEAST, MOMENT_LEAST = 0.05, 0.05
 #: An isolated axis of the model is left to the sensors: 1 sigma of what it may miss [m/s^2, rad/s^2].
 FORCE_FREE, MOMENT_FREE = 5.0, 30.0
+#: So is all of it that a sensor can tell below this height over where it stood [m]: what the ground does, no model here knows.
+LOW = 1.0
 
 
 @jit
-def share_of(x: Any, i: int) -> float:
-    """β of a local filter: `SHARES` over those that hear anything."""
-    total, own = 0.0, 0.0
+def set_shares(x: Any) -> None:
+    """Shares β of the local filters: `SHARES` over those that hear anything, over all where none does."""
+    total = 0.0
     for k in range(LOCAL_FILTERS):
-        if x.lf[k].axes != 0:
-            total += SHARES[k]
-            if k == i:
-                own = SHARES[k]
-    return float(own / total)
+        total += SHARES[k] if x.lf[k].axes != 0 else 0.0
+    for k in range(LOCAL_FILTERS):
+        f = x.lf[k]
+        if total > 0.0:
+            f.share = SHARES[k] / total if f.axes != 0 else 0.0
+        else:
+            f.share = SHARES[k]
 
 
 @jit
 def unit(a: int) -> Vec:
     """Unit vector along axis a."""
     return (1.0 if a == 0 else 0.0, 1.0 if a == 1 else 0.0, 1.0 if a == 2 else 0.0)
-
-
-@jit
-def alive(m: Any) -> bool:
-    """Whether a local filter has anything left to hear."""
-    return bool(m.axes != 0)
 
 
 @jit
@@ -148,16 +154,16 @@ def swing_noise(s: Any, prm: Any, a: int) -> float:
 
 
 @jit
-def add_noise(s: Any, prm: Any, P: Any, C: Mat, dt: float, share: float) -> None:
-    """Noise of the process over one interval, ``share`` (1/β) times: what the model misses, gusts, walks of sensors' biases not."""
+def add_noise(s: Any, prm: Any, P: Any, C: Mat, dt: float, share: float, low: bool) -> None:
+    """Noise of the process over one interval, ``share`` (1/β) times: what the model misses (near the ground ``low`` all), and gusts."""
     m, x = s.model[0], s.ft[0]
     k = share * dt
     blow = gust(s, prm)
     for i in range(3):
         moment, force = miss(s, prm, 3 + i), miss(s, prm, i)
-        if x.isolated & (1 << (6 + i)):
+        if (low and x.lf[LF_ACCEL].axes & (1 << i)) or x.isolated & (1 << (6 + i)):
             force = FORCE_FREE
-        if x.isolated & (1 << (9 + i)):
+        if (low and x.lf[LF_GYRO].axes & (1 << i)) or x.isolated & (1 << (9 + i)):
             moment = MOMENT_FREE
         P[i, i] += k * swing_noise(s, prm, i)
         P[3 + i, 3 + i] += k * 1e-9
@@ -173,6 +179,20 @@ def add_noise(s: Any, prm: Any, P: Any, C: Mat, dt: float, share: float) -> None
         for i in range(2):
             P[18 + i, 18 + i] += k * 2.0 * blow * blow / prm.air_gust_time
             P[20 + i, 20 + i] += k * prm.noise_wind_mean * prm.noise_wind_mean
+    else:
+        for i in range(2):
+            P[18 + i, 18 + i] += k * STILL
+            P[20 + i, 20 + i] += k * 0.01 * STILL
+
+
+@jit
+def add_walks(prm: Any, P: Any, k: float) -> None:
+    """Walks of the sensors' biases over k = dt/β."""
+    if prm.fault_tolerant_biases > 0.0:
+        for i in range(3):
+            P[GYRO_BIAS + i, GYRO_BIAS + i] += k * prm.noise_gyro_bias * prm.noise_gyro_bias
+            P[ACCEL_BIAS + i, ACCEL_BIAS + i] += k * prm.noise_accel_bias * prm.noise_accel_bias
+        P[BARO_OFFSET, BARO_OFFSET] += k * prm.noise_baro_bias * prm.noise_baro_bias
 
 
 @jit
@@ -185,20 +205,11 @@ def predict_all(s: Any, prm: Any, dt: float) -> tuple[Linear, Mat, Vec]:
     T = transition(C, (x.w[0], x.w[1], x.w[2]), force, v, lin[2], lin[3], lin[4], lin[5], dt, keep, math.exp(-dt / MISS_TIME))
     for i in range(LOCAL_FILTERS):
         f = x.lf[i]
-        if alive(f):
+        if f.share > 0.0:
             carry(f, T)
             carry_vector(f.dx, T)
-            add_noise(s, prm, f.P, C, dt, 1.0 / share_of(x, i))
-            walk = 0.0
-            if i == LF_GYRO:
-                walk = prm.noise_gyro_bias
-            elif i == LF_ACCEL:
-                walk = prm.noise_accel_bias
-            elif i == LF_BARO:
-                walk = prm.noise_baro_bias
-            if prm.fault_tolerant_biases > 0.0:
-                for a in range(3):
-                    f.P[22 + a, 22 + a] += walk * walk * dt
+            add_noise(s, prm, f.P, C, dt, 1.0 / f.share, x.ground - x.p[2] < LOW)
+            add_walks(prm, f.P, dt / f.share)
     return lin, C, v
 
 
@@ -225,8 +236,8 @@ def fuse_inertial(s: Any, prm: Any, lin: Linear, C: Mat, v: Vec, gyro: Vec, acce
     r = (prm.noise_gyro * prm.noise_gyro + prm.noise_gyro_scale * prm.noise_gyro_scale * rate) / dt
     for a in range(3):
         if g.axes & (1 << a):
-            H = ((RATE, unit(a)), (OWN, unit(a)), NONE)
-            scalar(g, H, gyro[a] - g.own[a], r, 1e9)
+            H = ((RATE, unit(a)), (GYRO_BIAS, unit(a)), NONE)
+            scalar(g, H, gyro[a] - x.bg[a], r, 1e9)
     D_a, D_w = lin[2], lin[3]
     by_theta, by_v = mul_mat(D_a, cross_matrix(v)), mul_mat(D_a, transpose(C))
     for a in range(3):
@@ -234,9 +245,9 @@ def fuse_inertial(s: Any, prm: Any, lin: Linear, C: Mat, v: Vec, gyro: Vec, acce
             r = (prm.noise_accel * prm.noise_accel + left_over(s, prm, a) * s.model[0].window[0]) / dt
             b = by_v[a]
             H6 = (
-                (RATE, D_w[a]), (ATTITUDE, by_theta[a]), (SPEED, b), (FORCE, unit(a)), (WIND, (-b[0], -b[1], 0.0)), (OWN, unit(a)),
+                (RATE, D_w[a]), (ATTITUDE, by_theta[a]), (SPEED, b), (FORCE, unit(a)), (WIND, (-b[0], -b[1], 0.0)), (ACCEL_BIAS, unit(a)),
             )  # fmt: skip
-            scalar(h, H6, accel[a] - h.own[a], r, 1e9)
+            scalar(h, H6, accel[a] - x.ba[a], r, 1e9)
 
 
 @jit
@@ -282,10 +293,10 @@ def fuse_sensors(s: Any, prm: Any, C: Mat) -> None:
             scalar(f, ((ATTITUDE, h), NONE, NONE), e, r1, prm.gate_magnetometer)
         elif m.kind == BAROMETER and x.lf[LF_BARO].axes & 1:
             f = x.lf[LF_BARO]
-            e = m.z[0] - s.origin[2] + x.p[2] - f.own[0]
+            e = m.z[0] - s.origin[2] + x.p[2] - x.baro
             scalar(
                 f,
-                ((PLACE, (0.0, 0.0, -1.0)), (OWN, (1.0, 0.0, 0.0)), NONE),
+                ((PLACE, (0.0, 0.0, -1.0)), (BARO_OFFSET - 2, (0.0, 0.0, 1.0)), NONE),
                 e,
                 prm.noise_barometer * prm.noise_barometer,
                 prm.gate_barometer,
@@ -310,32 +321,40 @@ def correct(x: Any, d: Any) -> None:
 
 @jit
 def fusion(s: Any, prm: Any) -> None:
-    """All local filters into one state, and that shared out again; with no reset they keep their own opinion."""
+    """All local filters into one state, and that shared out again; with no reset they keep their own opinion.
+
+    What a local filter heard until now counts, then its share goes to the others if it hears no more. With no reset it is left out at once,
+    with all that it has come to believe, and what the others know is shared out anew.
+    """
     x = s.ft[0]
-    n = 0
+    anew, n = prm.fault_tolerant_reset == 0.0, 0
     for i in range(LOCAL_FILTERS):
-        if alive(x.lf[i]):
+        f = x.lf[i]
+        if f.changed == 0 and f.share > 0.0:
             n += 1
-    if n == 0:
-        return
-    for i in range(22):
+        anew = anew or f.changed == 1
+    for i in range(STATES):
         x.y[i] = 0.0
-        for j in range(22):
+        for j in range(STATES):
             x.P[i, j] = 0.0
     for i in range(LOCAL_FILTERS):
         f = x.lf[i]
-        if alive(f):
+        if f.share > 0.0 and (f.changed == 0 or n == 0 or prm.fault_tolerant_reset == 0.0):
             add_information(x, f)
     fused(x)
     correct(x, x.dx)
+    for i in range(3):
+        x.bg[i] += x.dx[GYRO_BIAS + i]
+        x.ba[i] += x.dx[ACCEL_BIAS + i]
+    x.baro += x.dx[BARO_OFFSET]
+    if anew:
+        set_shares(x)
     for i in range(LOCAL_FILTERS):
         f = x.lf[i]
-        if alive(f):
-            if prm.fault_tolerant_reset > 0.0:
-                keep_apart(x, f)
+        f.changed = 0
+        if f.share > 0.0:
+            if anew:
+                share_out(x, f, f.share)
             else:
-                share_out(x, f, share_of(x, i))
-            for a in range(3):
-                f.own[a] += f.dx[22 + a]
-                f.dx[22 + a] = 0.0
+                keep_apart(x, f)
     x.n_fused += 1

@@ -6,59 +6,16 @@ from typing import Any
 
 from haltere._jit import jit
 from haltere.estimators.federated_layout import LF_ACCEL, LF_BARO, LF_GYRO, LOCAL_FILTERS
-from haltere.estimators.local_filters import SHARES, miss
+from haltere.estimators.local_filters import miss, set_shares
+from haltere.filter.federated import share_out
+from haltere.strapdown.dynamics import ACCEL_BIAS, BARO_OFFSET, GYRO_BIAS, STATES
 
 __all__ = ["begin", "set_axes"]
 
 #: What is not known of the rate when it begins, 1 sigma [rad/s].
 RATE_SD = 0.1
-
-
-@jit
-def begin(s: Any, prm: Any, t: float) -> None:
-    """Take the ordinary filter's state for the fused one, and share it out; of the wind nothing is known."""
-    x = s.ft[0]
-    wind = prm.init_wind * prm.init_wind if prm.fault_tolerant_wind > 0.0 else 1e-12
-    for i in range(22):
-        x.dx[i] = 0.0
-        for j in range(22):
-            x.P[i, j] = 0.0
-    for i in range(3):
-        x.w[i], x.v[i], x.p[i] = s.w_raw[i] - s.bg[i], s.v[i], s.p[i]
-        x.bm[i], x.bf[i], x.a[i] = 0.0, 0.0, 0.0
-        x.P[i, i] = RATE_SD * RATE_SD
-        x.P[12 + i, 12 + i] = miss(s, prm, 3 + i) ** 2
-        x.P[15 + i, 15 + i] = miss(s, prm, i) ** 2
-    for i in range(9):
-        for j in range(9):
-            x.P[3 + i, 3 + j] = s.P[i, j]
-    for i in range(4):
-        x.q[i] = s.q[i]
-    for i in range(2):
-        x.wind[i], x.steady[i] = 0.0, 0.0
-        x.P[18 + i, 18 + i] = x.P[20 + i, 20 + i] = x.P[18 + i, 20 + i] = x.P[20 + i, 18 + i] = wind
-    for i in range(LOCAL_FILTERS):
-        f = x.lf[i]
-        f.axes = 7
-        for a in range(25):
-            f.dx[a] = 0.0
-            for b in range(25):
-                f.P[a, b] = x.P[a, b] / SHARES[i] if a < 22 and b < 22 else 0.0
-        for a in range(3):
-            f.P[22 + a, 22 + a], f.own[a] = 1e-12, 0.0
-    for a in range(3):
-        x.lf[LF_GYRO].own[a], x.lf[LF_ACCEL].own[a] = s.bg[a], s.ba[a]
-        for b in range(3):
-            x.lf[LF_GYRO].P[22 + a, 22 + b] = s.P[9 + a, 9 + b]
-            x.lf[LF_ACCEL].P[22 + a, 22 + b] = s.P[12 + a, 12 + b]
-    f = x.lf[LF_BARO]
-    f.own[0], f.P[22, 22] = s.baro_start, prm.init_baro_bias * prm.init_baro_bias
-    if len(s.baro) > 0:
-        f.own[0], f.P[22, 22] = s.baro[0], s.P[15, 15]
-    x.on, x.t_begun, x.t_fuse, x.n_fused = 1, t, t, 0
-    x.n, x.span = 0, 0.0
-    for a in range(3):
-        x.by_gyro[a], x.by_accel[a], x.by_model[a] = 0.0, 0.0, 0.0
+#: Wind and its mean begin alike to this correlation: wholly alike, their covariance could not be inverted.
+ALIKE = 0.9
 
 
 @jit
@@ -72,11 +29,12 @@ def excluded(x: Any, sensor: int, t: float) -> int:
 
 
 @jit
-def return_axis(f: Any, a: int, sd: float) -> None:
-    """An axis is heard again: of its bias no more is known than at first."""
-    for j in range(25):
-        f.P[22 + a, j], f.P[j, 22 + a] = 0.0, 0.0
-    f.P[22 + a, 22 + a] = sd * sd
+def open_bias(x: Any, j: int, sd: float) -> None:
+    """A sensor is heard again: of its bias, state j, no more is known than at first."""
+    for i in range(LOCAL_FILTERS):
+        f = x.lf[i]
+        if f.share > 0.0:
+            f.P[j, j] += sd * sd / f.share
 
 
 @jit
@@ -100,20 +58,63 @@ def set_axes(s: Any, prm: Any, t: float) -> None:
             axes = 0 if x.isolated & (1 << 14) else 1
         if axes == f.axes:
             continue
-        if f.axes == 0:
-            for a in range(25):
-                f.dx[a] = 0.0
-            for a in range(22):
-                for b in range(22):
-                    f.P[a, b] = 1e6 * x.P[a, b]  # nothing to say until the fused state is shared out anew
-            for a in range(3):
-                return_axis(f, a, 1e-6)
         for a in range(3):
             if axes & ~f.axes & (1 << a):
                 if i == LF_GYRO:
-                    return_axis(f, a, prm.init_gyro_bias)
+                    open_bias(x, GYRO_BIAS + a, prm.init_gyro_bias)
                 elif i == LF_ACCEL:
-                    return_axis(f, a, prm.init_accel_bias)
+                    open_bias(x, ACCEL_BIAS + a, prm.init_accel_bias)
                 elif i == LF_BARO and a == 0:
-                    return_axis(f, a, prm.init_baro_bias)
-        f.axes = axes
+                    open_bias(x, BARO_OFFSET, prm.init_baro_bias)
+        f.axes, f.changed = axes, 1
+
+
+@jit
+def begin(s: Any, prm: Any, t: float) -> None:
+    """Take the ordinary filter's state for the fused one, and share it out; of the wind nothing is known."""
+    x = s.ft[0]
+    wind = prm.init_wind * prm.init_wind if prm.fault_tolerant_wind > 0.0 else 1e-9
+    for i in range(STATES):
+        x.dx[i] = 0.0
+        for j in range(STATES):
+            x.P[i, j] = 0.0
+    for i in range(3):
+        x.w[i], x.v[i], x.p[i] = s.w_raw[i] - s.bg[i], s.v[i], s.p[i]
+        x.bm[i], x.bf[i], x.a[i] = 0.0, 0.0, 0.0
+        x.P[i, i] = RATE_SD * RATE_SD
+        x.P[12 + i, 12 + i] = miss(s, prm, 3 + i) ** 2
+        x.P[15 + i, 15 + i] = miss(s, prm, i) ** 2
+    for i in range(9):
+        for j in range(9):
+            x.P[3 + i, 3 + j] = s.P[i, j]
+        for j in range(6):
+            x.P[3 + i, GYRO_BIAS + j] = x.P[GYRO_BIAS + j, 3 + i] = s.P[i, 9 + j]
+    for i in range(4):
+        x.q[i] = s.q[i]
+    for i in range(2):
+        x.wind[i], x.steady[i] = 0.0, 0.0
+        x.P[18 + i, 18 + i] = x.P[20 + i, 20 + i] = wind
+        x.P[18 + i, 20 + i] = x.P[20 + i, 18 + i] = ALIKE * wind
+    for i in range(3):
+        x.bg[i], x.ba[i] = s.bg[i], s.ba[i]
+    for i in range(6):
+        for j in range(6):
+            x.P[GYRO_BIAS + i, GYRO_BIAS + j] = s.P[9 + i, 9 + j]
+    x.baro, x.P[BARO_OFFSET, BARO_OFFSET] = s.baro_start, prm.init_baro_bias * prm.init_baro_bias
+    if len(s.baro) > 0:
+        x.baro, x.P[BARO_OFFSET, BARO_OFFSET] = s.baro[0], s.P[15, 15]
+        for j in range(9):
+            x.P[3 + j, BARO_OFFSET] = x.P[BARO_OFFSET, 3 + j] = s.P[j, 15]
+        for j in range(6):
+            x.P[GYRO_BIAS + j, BARO_OFFSET] = x.P[BARO_OFFSET, GYRO_BIAS + j] = s.P[9 + j, 15]
+    for i in range(LOCAL_FILTERS):
+        x.lf[i].axes, x.lf[i].changed = 7, 0
+    set_axes(s, prm, t)
+    set_shares(x)
+    for i in range(LOCAL_FILTERS):
+        x.lf[i].changed = 0
+        share_out(x, x.lf[i], max(x.lf[i].share, 1e-6))
+    x.on, x.t_begun, x.t_fuse, x.n_fused = 1, t, t, 0
+    x.n, x.span = 0, 0.0
+    for a in range(3):
+        x.by_gyro[a], x.by_accel[a], x.by_model[a] = 0.0, 0.0, 0.0

@@ -33,6 +33,11 @@ def verdict(kind: str, record: np.void, S: NDArray[np.void], events: list[dict[s
                 e["t_recovered"] = t
                 e["evidence"] += f"; agrees again, heard from {t:.2f} s on"
                 return
+        if sensor == "model":  # an axis that a rotor took with it
+            for e in reversed(events):
+                if e["sensor"] == "rotors" and e["t_isolated"] is not None:
+                    e["evidence"] += f"; {axis} is right again from {t:.2f} s on"
+                    return
         return
     finding = S["ft"]["finding"][0, 0, int(record["value"])]
     when, most = finding["when"], finding["most"]

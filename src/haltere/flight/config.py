@@ -25,7 +25,7 @@ PRESETS: dict[str, tuple[str, ...]] = {
     "ahrs": ("default",),
     "two-stage": ("default", "as-corrected", "as-printed"),
     "wind-attitude": ("default", "as-corrected", "as-printed"),
-    "fault-tolerant": ("default",),
+    "fault-tolerant": ("default", "as-corrected"),
 }
 ESTIMATORS = tuple(PRESETS)
 
@@ -397,6 +397,11 @@ _PRESET_OVERRIDES["two-stage", "as-printed"] = _PRESET_OVERRIDES["two-stage", "a
     "two_stage.index": "algebraic",
     "two_stage.height_sign": "plus",
 }
+_PRESET_OVERRIDES["fault-tolerant", "as-corrected"] = {
+    "fault_tolerant.detector": "snapshot", "fault_tolerant.wind": "off", "diagnosis.inertial": "off",
+    "diagnosis.false_alarms": 2.8,  # 1e-6 a residual: 600 of J11 to J16 a second, 190 of the others
+    "gate.gnss": _NO_GATE, "gate.magnetometer": _NO_GATE, "gate.barometer": _NO_GATE, "noise.field": 0.0,
+}  # fmt: skip
 _PRESET_OVERRIDES["wind-attitude", "as-corrected"] = {
     "wind_attitude.filter": "quaternion", "aid.magnetometer": "3-axis", "gate.magnetometer": _NO_GATE, "gate.air": _NO_GATE,
     "noise.field": 0.0, "aid.airdata": "on",
@@ -411,6 +416,10 @@ _QUATERNION = (
     "timeout.imu", "field.", "home.", "init.tilt_", "init.yaw_", "init.accel_bias", "rest.gyro", "rest.gravity", "imu.kind", "unit.",
     "axes.", "magnetometer.offset_", "magnetometer.matrix_", "magnetometer.load", "air.density", "drag.", "wind_attitude.", *_GIVEN_WIND,
 )  # fmt: skip
+_TWO_STAGE_OFF = (
+    "aid.barometer", "baro.offset", "aid.fake_velocity", "aid.zero_velocity", "aid.zero_rate", "aid.yaw_bank", "aid.compass_watch",
+    "aid.motor_field",
+)  # fmt: skip
 #: Keys that an estimator does not have: changing them would change nothing, or make it another one.
 _FIXED: dict[str, tuple[str, ...]] = {
     "navigator": (*_TWO_STAGE, *_WIND_ATTITUDE, *_GIVEN_WIND, *_FAULT_TOLERANT),
@@ -422,14 +431,7 @@ _FIXED: dict[str, tuple[str, ...]] = {
         *_EXCLUDE,
         *_WIND_ATTITUDE,
         *_AIR,
-        "aid.barometer",
-        "baro.offset",
-        "aid.fake_velocity",
-        "aid.zero_velocity",
-        "aid.zero_rate",
-        "aid.yaw_bank",
-        "aid.compass_watch",
-        "aid.motor_field",
+        *_TWO_STAGE_OFF,
         *_DIAGNOSIS,
         "magnetometer.refine",
         "noise.mag_offset",
@@ -498,16 +500,14 @@ def defaults(estimator: str = "navigator", preset: str = "default") -> dict[str,
         hint = f"did you mean {near[0]!r}?" if near else f"one of {', '.join(ESTIMATORS)}"
         raise UsageError("an estimator", repr(estimator), "--estimator", hint)
     if preset not in PRESETS[estimator]:
-        alone = f"{estimator} is not one of the published designs, so it has no printed or corrected form"
-        if estimator == "fault-tolerant":
-            lost = "the printed thresholds of source F are lost, and most of its formulas with them; as-corrected is not there yet"
-            raise UsageError(f"a preset of {estimator} ({', '.join(PRESETS[estimator])})", repr(preset), "--preset", lost)
-        raise UsageError(
-            f"a preset of {estimator} ({', '.join(PRESETS[estimator])})",
-            repr(preset),
-            "--preset",
-            alone if len(PRESETS[estimator]) == 1 else "",
+        why = (
+            f"{estimator} is not one of the published designs, so it has no printed or corrected form"
+            if len(PRESETS[estimator]) == 1
+            else ""
         )
+        if estimator == "fault-tolerant":
+            why = "the printed thresholds of source F are lost, and most of its formulas with them"
+        raise UsageError(f"a preset of {estimator} ({', '.join(PRESETS[estimator])})", repr(preset), "--preset", why)
     return {key: spec.default for key, spec in KEYS.items()} | _OVERRIDES[estimator] | _PRESET_OVERRIDES.get((estimator, preset), {})
 
 

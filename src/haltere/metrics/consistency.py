@@ -191,7 +191,10 @@ def nees_series(solution: Solution, truth: Stream) -> dict[str, tuple[FloatArray
         if block in errors and block in cov:
             e = errors[block]
             k = e.shape[1]
-            out[block] = (t, _squared_distance(e, cov[block][inside, :k, :k]) / k)
+            nees = _squared_distance(e, cov[block][inside, :k, :k]) / k
+            there = np.isfinite(nees)  # an estimator may have no wind on the ground
+            if there.any():
+                out[block] = (t[there], nees[there])
     return out
 
 

@@ -148,6 +148,10 @@ def error_series(solution: Solution, reference: Stream) -> Series:
                 out[name] = (t, (np.interp(t, solution.t, solution[name]) if rows is None else solution[name][rows]) - value)
             elif good.any():
                 out[name] = (t[good], np.interp(t[good], solution.t, solution[name]) - value[good])
+            if name in out and stem == "wind":  # an estimator may have none on the ground
+                there = np.isfinite(out[name][1])
+                if not there.all():
+                    out[name] = (out[name][0][there], out[name][1][there])
     return out
 
 

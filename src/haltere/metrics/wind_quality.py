@@ -88,6 +88,9 @@ def quality(solution: Solution, flight: FlightLog, w: WindSeries) -> Quality:
         judge.say("the vehicle was not in flight, as far as the log tells", 3)
         return judge.quality
     sensors = [s for s in AIR if np.any((solution.aids["sensor"] == s) & (solution.aids["status"] != "rejected"))]
+    if not sensors and solution.config.estimator == "fault-tolerant":
+        judge.say("felt through the force of the vehicle's model, which leaves no innovations to judge it by", 1)
+        return judge.quality
     if not sensors:
         judge.say("nothing that feels the air was let in: the wind is what it was assumed to be", 3)
         return judge.quality

@@ -7,7 +7,7 @@ east). Errors are true minus estimate, that of the attitude in the body frame; 2
 δω̇ = M_ω δω + M_a δv_a + δb_M;  δθ̇ = -[ω]× δθ + δω;  δv̇ = C (-[f]× δθ + D_ω δω + D_a δv_a + δb_F);  δṗ = δv;  Ẇ = -(W - W̄)/τ,
 ḃ = -b/τ_b,
 
-where δv_a = [v_a]× δθ + Cᵀ (δv - δW). Three states of a filter's own may follow; they are constant.
+where δv_a = [v_a]× δθ + Cᵀ (δv - δW). Constants may follow: biases of gyro, accelerometer, barometer, of which this knows no more.
 """
 
 from __future__ import annotations
@@ -32,13 +32,14 @@ from haltere.core.rotation import (
 )
 
 __all__ = [
-    "ATTITUDE", "COMMON", "FORCE", "MEAN", "MOMENT", "OWN", "PLACE", "RATE", "SPEED", "STATES", "WIND", "Transition", "air_velocity",
-    "carry", "carry_vector", "move", "transition",
+    "ACCEL_BIAS", "ATTITUDE", "BARO_OFFSET", "FORCE", "GYRO_BIAS", "MEAN", "MOMENT", "MOVING", "PLACE", "RATE", "SPEED", "STATES", "WIND",
+    "Transition", "air_velocity", "carry", "carry_vector", "move", "transition",
 ]  # fmt: skip
 
-#: First column of each block; then the states that all filters share, the first one of a filter's own, and how many there are in all.
-RATE, ATTITUDE, SPEED, PLACE, MOMENT, FORCE, WIND, MEAN, OWN = (constant(i) for i in (0, 3, 6, 9, 12, 15, 18, 20, 22))
-COMMON, STATES = 22, 25
+#: First column of each block; then how many states move, and how many there are with the constants.
+RATE, ATTITUDE, SPEED, PLACE, MOMENT, FORCE, WIND, MEAN = (constant(i) for i in (0, 3, 6, 9, 12, 15, 18, 20))
+GYRO_BIAS, ACCEL_BIAS, BARO_OFFSET = (constant(i) for i in (22, 25, 28))
+MOVING, STATES = constant(22), constant(29)
 
 #: Blocks of the transition that are neither zero nor one: ω ← ω, θ, v; θ ← θ; v ← ω, θ, v, b_F; then the interval [s], and what is left
 #: after it of a gust, and of b_M and b_F. Against the wind, ω and v go as against v with the other sign.
@@ -184,18 +185,19 @@ def left(P: Any, n: int, T: Transition) -> None:
 
 @jit
 def carry(s: Any, T: Transition) -> None:
-    """Covariance ``s.P`` (25, 25) over one interval, A P Aᵀ; no noise is added."""
+    """Covariance ``s.P`` over one interval, A P Aᵀ; no noise is added. It has 22 states or more, see `MOVING`."""
     P = s.P
+    n = s.P.shape[0]
     for _half in range(2):
-        left(P, 25, T)
-        for i in range(25):
+        left(P, n, T)
+        for i in range(n):
             for j in range(i):
                 P[i, j], P[j, i] = P[j, i], P[i, j]
 
 
 @jit
 def carry_vector(x: Any, T: Transition) -> None:
-    """An error vector (25) over one interval, x <- A x."""
+    """An error vector over one interval, x <- A x."""
     Aww, Awt, Awv, Att, Avw, Avt, Avv, AvF, dt, keep, leak = T
     w, t = (x[0], x[1], x[2]), (x[3], x[4], x[5])
     a, b = (x[6] - x[18], x[7] - x[19], x[8]), (x[15], x[16], x[17])
