@@ -55,6 +55,17 @@ SENSORS = {"rotors": {"rate": 250.0}}
 START, AFTER = 22.0, 8.0
 IN_WIND = 2.5
 ON = {"diagnosis.inertial": "on"}
+#: With ``--quiet``: noise of theory-amendments.md 4, for which theory.md's delays hold (biases are the simulator's), told to the filter.
+QUIET: dict[str, dict[str, float]] = {
+    "imu": {"gyro_noise": 0.0005, "accel_noise": 0.015}, "barometer": {"noise": 0.3, "rate": 20.0}, "magnetometer": {"noise": 0.7, "rate": 10.0},
+}  # fmt: skip
+QUIET_NOISE = {"noise.gyro": 0.0005, "noise.accel": 0.015, "noise.barometer": 0.3}
+
+
+def be_quiet() -> None:
+    """Fly with the sensors of theory-amendments.md 4."""
+    SENSORS.update(QUIET)
+    ON.update({k: str(v) for k, v in QUIET_NOISE.items()})
 
 
 def vehicle(file: Path | None) -> Vehicle:
@@ -121,7 +132,7 @@ def fly(
 ) -> Iterator[dict[str, Any]]:
     """Every fault of ``todo`` under one condition, faults of sensors in the same flight."""
     on = START + 0.37 * (seed % 7)
-    sensors = {**SENSORS, "imu": {"rate": rate}}
+    sensors = {**SENSORS, "imu": {**SENSORS.get("imu", {}), "rate": rate}}
     scenario = Scenario(mission=mission, scale=MISSIONS[mission], duration=on + AFTER, seed=seed, wind=WINDS[wind], sensors=sensors,
                         landing=False, track=path if mission == "track" else None)  # fmt: skip
     clean = None
@@ -180,7 +191,7 @@ def quiet(of: Vehicle, path: FlightLog | None, begin: int, hours: float, rate: f
     while flown < hours * 3600.0:
         mission, wind = missions[i % len(missions)], list(WINDS)[(i // len(missions)) % 2]
         scenario = Scenario(mission=mission, scale=MISSIONS[mission], duration=120.0, seed=begin + i, wind=WINDS[wind],
-                            sensors={**SENSORS, "imu": {"rate": rate}}, track=path if mission == "track" else None)  # fmt: skip
+                            sensors={**SENSORS, "imu": {**SENSORS.get("imu", {}), "rate": rate}}, track=path if mission == "track" else None)  # fmt: skip
         solution = haltere.run(simulate(scenario), vehicle=of, set=ON, scored=False)
         keys = ("sensor", "axis", "kind", "t_onset", "t_detected", "t_isolated", "candidates", "evidence")
         span = float(solution.t[-1] - solution.t[0])
@@ -262,6 +273,7 @@ def main() -> None:
     parser.add_argument("--rate", type=float, default=250.0, help="of the IMU [Hz]")
     parser.add_argument("--track", type=Path)
     parser.add_argument("--part", type=float, nargs=2, default=(18.0, 140.0), help="of the track's log [s]")
+    parser.add_argument("--quiet", action="store_true", help="noise of theory-amendments.md 4")
     parser.add_argument("--hours", type=float, default=0.0)
     parser.add_argument("--quiet-seeds", type=int, default=51000)
     parser.add_argument("--vehicle", type=Path, help="file to keep the identified vehicle in")
@@ -270,6 +282,8 @@ def main() -> None:
     parser.add_argument("--show", action="store_true")
     a = parser.parse_args()
     warnings.simplefilter("ignore")
+    if a.quiet:
+        be_quiet()
     lines = [json.loads(x) for x in a.runs.read_text(encoding="utf-8").splitlines()] if a.runs.exists() else []
     done = {(x["word"], x["mission"], x["wind"], x["seed"]) for x in lines if not x.get("quiet")}
     of, path, what = vehicle(a.vehicle), track(a.track, *a.part), commit()

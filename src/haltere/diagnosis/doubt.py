@@ -36,7 +36,7 @@ SANK = 5.0
 #: in, and after a gap of the IMU.
 CONTACT, PUSHED, AFTER_FORCED, AFTER_GAP = 1.0, 20.0, 5.0, 3.0
 #: Parts of what a signature explains that it may leave, and so many sigma of what is usual; see docs/diagnosis.md.
-LEAVES, SIGMAS = 0.35, 4.0
+LEAVES, SIGMAS = 0.35, 2.0
 #: A fit must have been good for so long [s]; one that is not within that time after the alarm never is, and nothing is judged for a time.
 GOOD, NEVER, AFTER_NEVER = 0.3, 5.0, 8.0
 #: A compass is heard that spoke so long ago [s].

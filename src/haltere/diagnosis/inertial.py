@@ -354,7 +354,7 @@ def judge(s: Any, prm: Any) -> bool:
     sudden = lead >= F_ACCEL and b.t_seen - b.onset[k] < SUDDEN  # as what was measured is, and hardly an accelerometer
     if others == 0 and s.t - b.t_seen >= (SETTLE if lead < F_VELOCITY and not sudden else LASTS):
         return name(s, prm, lead)
-    if b.alarm == 1 and s.t - b.t_seen > TELL:
+    if b.alarm == 1 and s.t - b.t_seen > TELL and others == 1:  # a set of three says nothing yet
         b.alarm = 2
         if lead < F_VELOCITY:
             if not doubt.named(b, lead, s.t):
