@@ -57,7 +57,8 @@ IN_WIND = 2.5
 ON = {"diagnosis.inertial": "on"}
 #: With ``--quiet``: noise of theory-amendments.md 4, for which theory.md's delays hold (biases are the simulator's), told to the filter.
 QUIET: dict[str, dict[str, float]] = {
-    "imu": {"gyro_noise": 0.0005, "accel_noise": 0.015}, "barometer": {"noise": 0.3, "rate": 20.0}, "magnetometer": {"noise": 0.7, "rate": 10.0},
+    "imu": {"gyro_noise": 0.0005, "accel_noise": 0.015}, "barometer": {"noise": 0.3, "rate": 20.0},
+    "magnetometer": {"noise": 0.7, "rate": 10.0},
 }  # fmt: skip
 QUIET_NOISE = {"noise.gyro": 0.0005, "noise.accel": 0.015, "noise.barometer": 0.3}
 
@@ -190,8 +191,9 @@ def quiet(of: Vehicle, path: FlightLog | None, begin: int, hours: float, rate: f
     flown, i = 0.0, 0
     while flown < hours * 3600.0:
         mission, wind = missions[i % len(missions)], list(WINDS)[(i // len(missions)) % 2]
-        scenario = Scenario(mission=mission, scale=MISSIONS[mission], duration=120.0, seed=begin + i, wind=WINDS[wind],
-                            sensors={**SENSORS, "imu": {**SENSORS.get("imu", {}), "rate": rate}}, track=path if mission == "track" else None)  # fmt: skip
+        sensors = {**SENSORS, "imu": {**SENSORS.get("imu", {}), "rate": rate}}
+        scenario = Scenario(mission=mission, scale=MISSIONS[mission], duration=120.0, seed=begin + i, wind=WINDS[wind], sensors=sensors,
+                            track=path if mission == "track" else None)  # fmt: skip
         solution = haltere.run(simulate(scenario), vehicle=of, set=ON, scored=False)
         keys = ("sensor", "axis", "kind", "t_onset", "t_detected", "t_isolated", "candidates", "evidence")
         span = float(solution.t[-1] - solution.t[0])
