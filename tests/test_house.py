@@ -13,6 +13,7 @@ import sys
 import tomllib
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 import haltere
@@ -138,3 +139,16 @@ def test_columns_have_units_frames_and_words(stream: str) -> None:
         assert column.doc, f"{column.name} has no words"
         if re.search(r"_[xyzned]$", column.name):
             assert column.frame, f"{column.name} is a vector component without a frame"
+
+
+def test_no_field_of_a_record_is_hidden_in_plain_python() -> None:
+    """`np.record` has methods; a field of such a name is read as the method when kernels run as plain Python."""
+    only_written = {("strapdown/layout.py", "size"), ("estimators/smoother.py", "T")}
+    hidden = {
+        (_name(p), m[1])
+        for p in MODULES
+        if _name(p).split("/")[0] in (*KERNEL_ROOMS, "estimators", "simulate")
+        for m in re.finditer(r'\("(\w+)",\s*(?:"[fiub]\d"|[A-Z_]{3,})', p.read_text(encoding="utf-8"))
+        if hasattr(np.record, m[1])
+    }
+    assert hidden <= only_written

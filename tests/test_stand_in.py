@@ -62,7 +62,7 @@ def begun(axes: tuple[int, ...], x: FloatArray, q0: Rotation) -> Any:
         [sum(1 << (a - 3) for a in axes if a >= 3), -1.0, 1e9],
     ]
     p["on"][0, 0, list(axes)] = 1
-    p["any"] = 1
+    p["standing"] = 1
     return s
 
 

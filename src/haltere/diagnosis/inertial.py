@@ -177,7 +177,7 @@ def known(s: Any) -> bool:
 @jit
 def sick(s: Any) -> bool:
     """Whether a channel of the IMU is known to fail, or a model stands in for one: then the bank has nothing to say."""
-    if len(s.pairs) > 0 and s.pairs[0].any != 0:
+    if len(s.pairs) > 0 and s.pairs[0].standing != 0:
         return True
     w = s.bank[0].step.wrong
     return int(w[0] | w[1] | w[2] | w[3] | w[4] | w[5]) != 0

@@ -109,8 +109,8 @@ def gather(s: Any, prm: Any, w: Vec, f: Vec, dt: float) -> bool:
     if s.t >= p.t_bias and p.t_first == 0.0:
         use_bias(s)
     for i in range(3):
-        p.sum[i] += (f[0], f[1], f[2])[i] - p.bias[i] - p.f[i]
-        p.sum[3 + i] += (w[0], w[1], w[2])[i] - p.bias[3 + i] - p.turn[i]
+        p.total[i] += (f[0], f[1], f[2])[i] - p.bias[i] - p.f[i]
+        p.total[3 + i] += (w[0], w[1], w[2])[i] - p.bias[3 + i] - p.turn[i]
     p.n += 1.0
     p.span += dt
     return p.span >= BLOCK - 0.4 * dt
@@ -139,7 +139,7 @@ def restart(s: Any) -> None:
     p.out, p.t_healed = s.compass.out, -1e9
     p.healed_out = s.bank[0].healed if len(s.bank) > 0 else 0
     for i in range(6):
-        p.sum[i], p.drift[i], p.level[i], p.told_size[i], p.t_hint[i] = 0.0, 0.0, 0.0, 0.0, -1e9
+        p.total[i], p.drift[i], p.level[i], p.told_size[i], p.t_hint[i] = 0.0, 0.0, 0.0, 0.0, -1e9
         calm_again(s, i)
     for i in range(3):
         p.t_step[i] = -1e9
@@ -181,7 +181,7 @@ def chain(s: Any, i: int, y: float, dt: float) -> float:
 def size_of(p: Any, i: int, rho: float, dt: float) -> float:
     """Size of what is in the window that says most: a force, or a moment from the innovations it makes in a settled chain."""
     w = p.w[i]
-    e = w.mean[0] * math.sqrt((1.0 + rho) / (1.0 - rho) * p.c0[i])
+    e = w.average[0] * math.sqrt((1.0 + rho) / (1.0 - rho) * p.c0[i])
     return e if i < FORCES else e * p.P[i, 0] / p.r[i] / dt  # a settled chain follows with its gain, P/r, of the innovation a block
 
 
@@ -196,8 +196,8 @@ def listen(s: Any, prm: Any) -> bool:
     learns = p.t_first == 0.0
     blown = by_lag(s)
     for i in range(AXES):
-        y = p.sum[i] / n
-        p.sum[i], p.residual[i] = 0.0, y
+        y = p.total[i] / n
+        p.total[i], p.residual[i] = 0.0, y
         if i < FORCES:
             y += p.by_v[0, i, 0] * blown[0] + p.by_v[0, i, 1] * blown[1] + p.by_v[0, i, 2] * blown[2]
         if first:
@@ -345,7 +345,7 @@ def _contradicted(s: Any, prm: Any, g: int, size: float, onset: float) -> bool:
         return False
     p = s.pairs[0]
     i = 3 + g if g < FORCES else g - 3
-    if s.t < onset + SHOWS or onset < p.t_calm + 2.0 or p.any != 0:
+    if s.t < onset + SHOWS or onset < p.t_calm + 2.0 or p.standing != 0:
         return False
     if i < FORCES and (s.t - p.t_across < FOLLOWS or p.calm > CALM_ENOUGH):
         return False
@@ -367,7 +367,7 @@ def _vouch(s: Any) -> bool:
     for i in range(FORCES, 6):
         if s.t - p.t_hint[i] < AGREED:
             return False
-    return bool(p.flying == 1 and p.any == 0 and p.n_blocks >= WARM and s.t - p.t_flying > AIRBORNE)
+    return bool(p.flying == 1 and p.standing == 0 and p.n_blocks >= WARM and s.t - p.t_flying > AIRBORNE)
 
 
 @jit

@@ -51,7 +51,7 @@ def twist_column(s: Any) -> int:
 def forget(s: Any) -> None:
     """Begin anew: after alignment."""
     p = s.pairs[0]
-    p.any, p.flying, p.head, p.wrong, p.ground, p.lifted = 0, 0, 0, 0, s.p[2], 0
+    p.standing, p.flying, p.head, p.wrong, p.ground, p.lifted = 0, 0, 0, 0, s.p[2], 0
     for i in range(len(p.lift)):
         p.lift[i], p.torque[i] = 0.0, 0.0
     p.t_ratio, p.t_mark, p.t_usual = -1e9, -1e9, s.t + 10.0
@@ -97,7 +97,7 @@ def alone(s: Any, k: int, v: float) -> None:
 @jit
 def stands(s: Any) -> bool:
     """Whether the model stands in for an axis."""
-    return s.pairs[0].any != 0
+    return s.pairs[0].standing != 0
 
 
 @jit
@@ -189,7 +189,7 @@ def onset_of(s: Any, i: int) -> float:
 def begin(s: Any, i: int, w: float) -> float:
     """Let the model stand in for an axis from here on; the rate to begin with, of a gyro axis that read ``w``, free of bias."""
     p = s.pairs[0]
-    p.on[i], p.any = 1, 1
+    p.on[i], p.standing = 1, 1
     t0 = onset_of(s, i)
     k = mark_before(p, t0)
     if i >= FORCES:
@@ -228,9 +228,9 @@ def end(s: Any, prm: Any, i: int) -> None:
         s.bg[i], s.twist[i] = p.kept[i], 0.0
         alone(s, 9 + i, prm.init_gyro_bias * prm.init_gyro_bias)
         alone(s, twist_column(s) + i, offset_variance(s, 3 + i))
-    p.any = 0
+    p.standing = 0
     for k in range(6):
-        p.any |= p.on[k]
+        p.standing |= p.on[k]
     p.n_blocks = 0
 
 
@@ -243,7 +243,7 @@ def stand_in(s: Any, prm: Any, w0: Vec, f0: Vec, w1: Vec, f1: Vec, dt: float) ->
             w0 = put(w0, i, (w0[0], w0[1], w0[2])[i] - s.bg[i])
             s.bg[i] = 0.0
     w = (w1[0] - s.bg[0], w1[1] - s.bg[1], w1[2] - s.bg[2])
-    if p.any != 0:
+    if p.standing != 0:
         w = (w0[0] if p.on[0] == 1 else w[0], w0[1] if p.on[1] == 1 else w[1], w0[2] if p.on[2] == 1 else w[2])
     if s.rotor_known == 1:
         evaluate(s, prm, w, dt)
@@ -256,7 +256,7 @@ def stand_in(s: Any, prm: Any, w0: Vec, f0: Vec, w1: Vec, f1: Vec, dt: float) ->
                 w0 = put(w0, i, rate)
         elif not want and p.on[i] == 1:
             end(s, prm, i)
-    if p.any == 0:
+    if p.standing == 0:
         return w0, f0, w1, f1
     s.rest.still = 0 if p.flying == 1 else s.rest.still
     known = s.rotor_known == 1

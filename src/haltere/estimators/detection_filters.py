@@ -191,7 +191,7 @@ def detect_inertial(s: Any, prm: Any, lin: Linear, C: Mat, gyro: Vec, accel: Vec
         before = x.alarms & (1 << i)
         fast(s, prm, FORCES + i, e / math.sqrt(S), x.t)
         if before == 0 and x.alarms & (1 << i):
-            x.size[i] = abs(x.fast[i].mean[0]) * math.sqrt(S)
+            x.lacking[i] = abs(x.fast[i].average[0]) * math.sqrt(S)
     if x.t - x.t_held > HELD and x.alarms == 0:
         x.t_held = x.t
         for i in range(3):

@@ -105,7 +105,7 @@ def federated() -> np.dtype[np.void]:
         ("when", "f8", N_DETECTORS),
         ("most", "f8", N_DETECTORS),
         ("alarms", "i8"),
-        ("size", "f8", 3),  # force that J11-J13 missed when they first alarmed [m/s^2]
+        ("lacking", "f8", 3),  # force that J11-J13 missed when they first alarmed [m/s^2]
         ("held", "f8", (2, 3)),  # accelerometer bias of some seconds ago, and of later
         ("t_held", "f8"),
         ("t_jerked", "f8"),  # when J16 was last near an alarm

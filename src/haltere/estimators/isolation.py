@@ -180,7 +180,7 @@ def powerless(s: Any, prm: Any, t: float) -> int:
                 if b.live[k] == 1 and abs(b.onset[k] - x.when[a]) < 0.4:
                     known = max(known, float(b.den[(3 + a) * SLOTS + k]))
             need = math.sqrt(prm.diagnosis_threshold) + 2.33
-            if x.size[a] * x.size[a] * known < need * need:
+            if x.lacking[a] * x.lacking[a] * known < need * need:
                 return int(BY_IMU)
     return 0
 

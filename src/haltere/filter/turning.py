@@ -86,7 +86,7 @@ def begin(b: Any, t: float, y: float) -> None:
         k.r, k.share = UNKNOWN, 1.0
     k.t, k.o, k.d, k.y, k.n = t, y, 0.0, y, 1
     k.oo, k.od, k.dd, k.last, k.q, k.q_drift = k.r, 0.0, DRIFT * DRIFT, 0.0, 0.0, 0.0
-    k.sum, k.samples, k.t_block = 0.0, 0.0, t
+    k.total, k.samples, k.t_block = 0.0, 0.0, t
     for j in range(len(b.heading_o)):
         b.heading_o[j], b.heading_d[j] = b.e[j], 0.0
 
@@ -103,16 +103,16 @@ def measure(k: Any, t: float, y: float) -> None:
 @jit
 def adapt(k: Any, t: float, z: float) -> None:
     """Take a whitened innovation into how much of its own turning the compass shows, some means late."""
-    k.sum += z
+    k.total += z
     k.samples += 1.0
     if t - k.t_block < BLOCK:
         return
     i = k.blocks % LATE
     if k.blocks >= LATE:
         k.share = min(max(k.share * math.exp(FASTER * (min(k.late[i], MOST) - 1.0)), LEAST_SHARE), MOST_SHARE)
-    k.late[i] = k.sum * k.sum / k.samples
+    k.late[i] = k.total * k.total / k.samples
     k.blocks += 1
-    k.sum, k.samples, k.t_block = 0.0, 0.0, t
+    k.total, k.samples, k.t_block = 0.0, 0.0, t
 
 
 @jit

@@ -35,7 +35,7 @@ def windows(longest: int) -> np.dtype[np.void]:
             np.record,
             [
                 ("n", "i8"),  # samples so far
-                ("sum", "f8", 3),  # of all of them, and as it was before each of the last ones
+                ("total", "f8", 3),  # of all of them, and as it was before each of the last ones
                 ("before", "f8", (longest, 3)),
                 ("last", "f8", 3),  # sample before, not prewhitened
                 ("cusum", "f8", (2, 2, 3)),  # slow and swift, up and down, by component
@@ -44,7 +44,7 @@ def windows(longest: int) -> np.dtype[np.void]:
                 ("window", "i8"),  # samples of the window that gave it
                 ("slow", "f8"),
                 ("swift", "f8"),
-                ("mean", "f8", 3),  # mean of the residual over that window
+                ("average", "f8", 3),  # mean of the residual over that window
             ],
         ),
         align=True,
@@ -56,7 +56,7 @@ def empty(w: Any) -> None:
     """Forget every sample."""
     w.n, w.snapshot, w.glr, w.window, w.slow, w.swift = 0, 0.0, 0.0, 0, 0.0, 0.0
     for j in range(3):
-        w.sum[j], w.last[j], w.mean[j] = 0.0, 0.0, 0.0
+        w.total[j], w.last[j], w.average[j] = 0.0, 0.0, 0.0
         for i in range(2):
             w.cusum[i, 0, j], w.cusum[i, 1, j] = 0.0, 0.0
 
@@ -83,8 +83,8 @@ def take(w: Any, z: tuple[float, float, float], d: int, rho: float) -> float:
     for j in range(d):
         x = k * (z[j] - rho * w.last[j])
         w.last[j] = z[j]
-        w.before[i, j] = w.sum[j]
-        w.sum[j] += x
+        w.before[i, j] = w.total[j]
+        w.total[j] += x
         w.snapshot += x * x
         w.cusum[0, 0, j] = max(0.0, w.cusum[0, 0, j] + x - CUSUM_SLOW)
         w.cusum[0, 1, j] = max(0.0, w.cusum[0, 1, j] - x - CUSUM_SLOW)
@@ -99,7 +99,7 @@ def take(w: Any, z: tuple[float, float, float], d: int, rho: float) -> float:
         old = (w.n - m) % longest
         total = 0.0
         for j in range(d):
-            s = w.sum[j] - w.before[old, j]
+            s = w.total[j] - w.before[old, j]
             total += s * s
         if total > w.glr * m:
             w.glr, w.window = total / m, m
@@ -107,7 +107,7 @@ def take(w: Any, z: tuple[float, float, float], d: int, rho: float) -> float:
     if w.window > 0:
         old = (w.n - w.window) % longest
         for j in range(d):
-            w.mean[j] = (w.sum[j] - w.before[old, j]) / w.window
+            w.average[j] = (w.total[j] - w.before[old, j]) / w.window
     return w.glr
 
 

@@ -70,7 +70,7 @@ _TRACK = _record(
     ("r", "f8"),  # white variance, and from how many it is known
     ("known", "f8"),
     ("last", "f8"),  # whitened one before
-    ("sum", "f8"),  # of the whitened ones of this block, their number, when it began
+    ("total", "f8"),  # of the whitened ones of this block, their number, when it began
     ("samples", "f8"),
     ("t_block", "f8"),
     ("late", "f8", 8),  # squares of the means of the last blocks

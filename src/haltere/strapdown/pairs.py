@@ -29,7 +29,7 @@ def pairs() -> np.dtype[np.void]:
                 # axes told not to be used: bits, start, end [s], of gyro and accelerometer; axes that the model stands in for
                 ("told", "f8", (2, 4, 3)),
                 ("on", "i8", 6),
-                ("any", "i8"),
+                ("standing", "i8"),
                 ("kept", "f8", 6),  # bias of an axis as it was before
                 ("flying", "i8"),
                 ("t_flying", "f8"),  # since when
@@ -54,7 +54,7 @@ def pairs() -> np.dtype[np.void]:
                 ("next", "f8", 6),
                 ("t_bias", "f8"),
                 # block of samples: residual sums, number, when it ends
-                ("sum", "f8", 6),
+                ("total", "f8", 6),
                 ("n", "f8"),
                 ("span", "f8"),
                 ("t_block", "f8"),
