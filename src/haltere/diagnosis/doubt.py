@@ -33,8 +33,8 @@ SPARSE, SAMPLES = 0.05, 100.0
 #: How fast [s] it is forgotten how fast the vehicle rose or sank.
 SANK = 5.0
 #: After contact nothing is judged for so long [s]; it is a specific force this far [m/s^2] from the mean of late. After GNSS was forced
-#: in, and after a gap of the IMU.
-CONTACT, PUSHED, AFTER_FORCED, AFTER_GAP = 1.0, 20.0, 5.0, 3.0
+#: in, after a gap of the IMU, and after alignment in motion, whose errors are no fault.
+CONTACT, PUSHED, AFTER_FORCED, AFTER_GAP, AFTER_MOTION = 1.0, 20.0, 5.0, 3.0, 2.0
 #: Parts of what a signature explains that it may leave, and so many sigma of what is usual; see docs/diagnosis.md.
 LEAVES, SIGMAS = 0.35, 2.0
 #: A fit must have been good for so long [s]; one that is not within that time after the alarm never is, and nothing is judged for a time.
@@ -49,7 +49,8 @@ OFTEN, WITHIN, MUTE = 2, 30.0, 60.0
 def begin(s: Any) -> None:
     """Begin anew, at alignment: the vehicle may be anywhere."""
     b = s.bank[0]
-    b.aloft, b.floor, b.t_rest, b.t_contact, b.t_unfit, b.t_doubt = 0, s.p[2], -1e9, -1e9, -1e9, -1e9
+    b.aloft, b.floor, b.t_rest, b.t_contact, b.t_unfit = 0, s.p[2], -1e9, -1e9, -1e9
+    b.t_doubt = -1e9 if s.align.kind == 1 else s.t + AFTER_MOTION
     b.sank = 0.0
     for g in range(len(b.t_named)):
         b.t_named[g], b.n_named[g], b.t_mute[g] = -1e9, 0, -1e9
