@@ -52,7 +52,8 @@ OLD = 0.5
 LEAST_ROTOR = 0.015
 #: 1 sigma of what a rotor that has lost thrust has lost of its torque, beside that.
 TORQUE = 0.1
-#: Air that is still: the wind is below this [m/s]; for so long in the air before, in which the wind was learnt [s]; how many sigma of gusts a force must exceed.
+#: Air that is still: the wind is below this [m/s]; for so long in the air before, in which the wind was learnt [s]; how many sigma of gusts
+#: a force must exceed.
 STILL, STILL_FOR, BEYOND_GUSTS = 1.5, 15.0, 4.0
 #: Vertical gusts beside horizontal ones; drag by wind that an unknown one may have [1/s].
 DOWN, TYPICAL_DRAG = 0.5, 0.3
