@@ -50,7 +50,8 @@ def test_faults_of_model_and_rotor_are_named(identified: Vehicle, word: str, sen
     e, *later = told(identified, word)
     assert not later
     assert (e["sensor"], e["axis"], e["candidates"]) == (sensor, axis, candidates)
-    assert 0.0 <= e["t_detected"] - AT < 0.25 and e["t_isolated"] - AT < (2.5 if axis == "t" else 1.1)
+    named = 2.5 if axis == "t" else (1.1 if sensor == "rotors" else 0.6)  # opposite rotors may explain alike: looked at for longer
+    assert 0.0 <= e["t_detected"] - AT < 0.25 and e["t_isolated"] - AT < named
     assert e["statistic"] > e["threshold"] and "silent" in e["evidence"] and "J1" in e["evidence"]
 
 
