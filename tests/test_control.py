@@ -9,6 +9,7 @@ import pytest
 import haltere
 from haltere.flight.log import FlightLog
 from haltere.metrics.control import unanswered
+from haltere.report.words import verdict_of
 from haltere.simulate import Scenario, simulate
 
 WIND = {"n": 3.0, "gust": 0.6}
@@ -60,7 +61,9 @@ def test_the_crash_of_log_0041_is_no_sensor(shared_data: Path) -> None:
 def test_the_crash_of_log_0036_is_no_sensor(shared_data: Path) -> None:
     """It noses down to 40 deg while both front motors are held at their limit, three seconds before it rolls over."""
     flight = haltere.read(shared_data / "ardupilot" / "log_0036_mechanical_failure.bin")
-    (event,) = [e for e in haltere.run(flight).events if e["sensor"] == "rotors"]
+    solution = haltere.run(flight)
+    assert "first at t = 144.0 s: rotor.0 or rotor.2" in verdict_of(solution, flight).headline
+    (event,) = [e for e in solution.events if e["sensor"] == "rotors"]
     assert event["candidates"] == ["rotor.0", "rotor.2"]
     assert 143.8 < event["t_onset"] < event["t_detected"] < 147.3
     assert "motors 0, 2 at the highest command of the flight; imu.1 measures the same motion" in event["evidence"]

@@ -86,6 +86,7 @@ def verdict(c: Context) -> Verdict:
     compass = disturbances(solution.events)
     alone = compass and by_level["bad"] == ["magnetometer"] and not by_level["doubtful"] and compass[0]["t_onset"] > solution.t[0] + 2.0
     failed = [e for e in solution.events if e["sensor"] in ("gyro", "accel") and e["t_isolated"] is not None]
+    driven = [e for e in solution.events if e["sensor"] == "rotors" and e.get("candidates")]
     doubtful = by_level["doubtful"] or lost or drifting or torn or ill or alone or failed
     worst = 2 if (by_level["bad"] and not alone) or broken else 1 if doubtful else 0
     if broken:
@@ -94,6 +95,9 @@ def verdict(c: Context) -> Verdict:
         axes = _list(list(dict.fromkeys(f"{sensor_label(e['sensor'])} {e['axis']}" for e in failed)))
         healed = "its effect was taken back" if len(failed) == 1 else "their effects were taken back"
         headline = f"An inertial sensor failed: {axes}, first at t = {failed[0]['t_onset']:.1f} s; {healed} as far as it is known."
+    elif driven:
+        whose = " or ".join(driven[0]["candidates"])
+        headline = f"The vehicle did not do what its rotors should make it do, first at t = {driven[0]['t_onset']:.1f} s: {whose}."
     elif alone:
         times = f" {len(compass)} times" if len(compass) > 1 else ""
         headline = f"The compass was disturbed{times}, first at t = {compass[0]['t_onset']:.1f} s; the heading was held without it."
