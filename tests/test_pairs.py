@@ -66,6 +66,16 @@ def test_a_gyro_that_steps_is_named_at_once(identified: Vehicle) -> None:
     assert e["candidates"] == ["gyro.x"] and e["t_detected"] - AT < 0.1 and e["t_isolated"] - AT < 0.3
 
 
+def test_a_hover_as_quiet_as_rest_is_still_a_flight(identified: Vehicle) -> None:
+    """Sensors of theory-amendments.md 4 in still air meet every condition of rest but the rotors."""
+    quiet = {"imu": {"gyro_noise": 0.0005, "accel_noise": 0.015}}
+    word = f"accel.z:bias=0.8m/s2@{AT:g}"
+    flight = simulate(Scenario(mission="hover", duration=AT + 8.0, seed=96002, sensors=SENSORS | quiet, landing=False, fault=(word,)))
+    noise = {"noise.gyro": "0.0005", "noise.accel": "0.015"}
+    (e,) = alarms(haltere.run(flight, vehicle=identified, set=ON | noise, scored=False).events)
+    assert e["candidates"] == ["accel.z"] and 0.0 <= e["t_detected"] - AT < 0.15
+
+
 def test_wind_convicts_nobody(identified: Vehicle) -> None:
     for e in told(identified, f"wind.n:step=4m/s@{AT:g}"):
         assert "wind" in e["candidates"] and e["t_isolated"] is None

@@ -256,9 +256,10 @@ def stand_in(s: Any, prm: Any, w0: Vec, f0: Vec, w1: Vec, f1: Vec, dt: float) ->
                 w0 = put(w0, i, rate)
         elif not want and p.on[i] == 1:
             end(s, prm, i)
+    if p.flying == 1:  # carried by its rotors: a hover in still air is as quiet as rest
+        s.rest.still = 0
     if p.standing == 0:
         return w0, f0, w1, f1
-    s.rest.still = 0 if p.flying == 1 else s.rest.still
     known = s.rotor_known == 1
     down = dcm((s.q[0], s.q[1], s.q[2], s.q[3]))[2]
     for i in range(3):
