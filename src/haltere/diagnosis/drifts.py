@@ -18,9 +18,9 @@ __all__ = ["LASTS", "forget_means", "lasting", "shift_means", "take_means", "wal
 #: How long what a force is off by lasts [s]; part of its variance that neighbouring means over a second differ by, and that of such a mean.
 LASTS, APART, MEAN = 0.7, 0.75, 0.65
 #: The offset walks by 1 sigma of that in this time [s].
-SLOWLY = 10.0
+SLOWLY = 40.0
 #: Blocks of a mean; how many differences the file's word is worth, how many are remembered; most of one, over what is expected.
-BLOCKS, PRIOR, MEMORY, LONE = 100.0, 2.0, 20.0, 9.0
+BLOCKS, PRIOR, MEMORY, LONE = 100.0, 1.0, 20.0, 9.0
 #: Least 1 sigma that is believed in [m/s^2], most of the file's variance.
 LEAST_SD, MOST = 0.03, 4.0
 FORCES = constant(3)

@@ -22,7 +22,7 @@ from haltere.diagnosis.drifts import LASTS, forget_means, lasting
 from haltere.diagnosis.pairs import BLOCK, CALM_ENOUGH, calm_again, change, listen, shift_bias, would_show
 from haltere.diagnosis.rate_step import began, shape
 from haltere.diagnosis.stand_in import density_of_noise, mark_before, offset_variance
-from haltere.diagnosis.wind_or_force import WIND, best, follow, start
+from haltere.diagnosis.wind_or_force import WIND, best, by_chance, follow, start
 from haltere.filter.signatures import ACCEL, SLOTS, clear
 from haltere.strapdown.propagate import gusts, inject
 
@@ -45,8 +45,9 @@ EARLY, COLLECT, WAIT, LONGER = 0.08, 0.3, 6.0, 2.0
 COMPARED = 2.5
 #: By how much a hypothesis must explain better, in twice the log likelihood; what a signature is off by itself, and least 1 sigma.
 MARGIN, LIKE, LEAST_M, LEAST_F = 9.0, 0.2, 0.15, 0.04
-#: A change that is the wind beyond doubt, soon; what a force must explain better than what the model is off by in this flight.
-SURE, WORTH = 40.0, 16.0
+#: A change that is the wind beyond doubt, soon; what a force must explain better than what the model is off by in this flight, and less
+#: than what it is not looked at any longer.
+SURE, WORTH, LITTLE = 40.0, 24.0, 6.0
 #: Two rotors that explain alike within the first are both named, within the second they are looked at for longer.
 NEARLY, UNLIKE = 1.0, 3.0
 #: A moment that has lasted for so long [s] before its alarm is dated anew.
@@ -63,8 +64,8 @@ DOWN, TYPICAL_DRAG = 0.5, 0.3
 #: What must speak against an accelerometer's fault of the size, in twice the log likelihood: that one of size² D = d would do so by chance
 #: has the probability Φ(-(d + 16)/(2 √d)), at most that of four sigma.
 AGAINST = 16.0
-#: How long forces are not listened to [s]: after a verdict, and where there was none.
-DEAF, SOON = 5.0, 1.5
+#: How long forces are not listened to [s]: after a verdict, after a change of the wind, and where there was nothing.
+DEAF, SOON, BRIEFLY = 5.0, 1.5, 0.5
 #: A fault is over when the change is its reverse within this part.
 REVERSE = 0.4
 #: A step of the gyro and the onset of what turned the compass are one if so near [s]; part of a step that its size may be off by.
@@ -435,13 +436,15 @@ def of_forces(s: Any, prm: Any, since: float) -> None:
     if since > COMPARED and gap < (-MARGIN if since > WAIT else -SURE):
         settle_forces(s, SOON)
         return
-    if since > 1.0 and abs(size) < max(0.5 * prm.diagnosis_force, BEYOND_GUSTS * by_gusts(s, prm, a)):  # gusts, or gone by itself
-        settle_forces(s, SOON)
+    small = abs(size) < max(0.5 * prm.diagnosis_force, BEYOND_GUSTS * by_gusts(s, prm, a))
+    if since > 1.0 and (small or (worth < LITTLE and since > 1.5)):  # gusts, chance, or gone by itself
+        settle_forces(s, BRIEFLY)
         return
     if len(s.bank) > 0 and s.bank[0].alarm != 0 and since < WAIT:  # an inertial fault is about to be named
         return
     quiet = silent(s, prm, a, size)
-    windy = gap < MARGIN or len(s.wind) == 0
+    decided = gap + (by_chance(s, a) if p.moved > 1.0 else 0.0)  # in hover a wind along an axis is no chance to convict on
+    windy = decided < (MARGIN if since < WAIT else 0.5 * MARGIN) or len(s.wind) == 0
     if worth > WORTH and others > MARGIN and not windy and quiet == 1:
         conclude(s, a, MODEL + a, size, 0.05, UP << a, E_FAULT)
         settle_forces(s, DEAF)
@@ -452,4 +455,4 @@ def of_forces(s: Any, prm: Any, since: float) -> None:
     if since > WAIT:
         if worth > WORTH and quiet == 0 and not windy:  # three that it may be are no verdict
             conclude(s, a, MODEL + a, size, 0.05, (UP << a) | (UP << (B_ACCEL + a)), E_SUSPECT)
-        settle_forces(s, DEAF)
+        settle_forces(s, SOON)

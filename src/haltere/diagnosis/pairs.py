@@ -52,6 +52,8 @@ EARLY_LEARN = 100.0
 QUICK, SETTLED, LEAST_SCALE, MOST_SCALE = 0.2, 0.02, 0.01, 4.0
 #: As in `haltere.diagnosis.inertial`: over how many usual ones a threshold is, stretch [s], how fast that is learnt, its bound.
 BEYOND_USUAL, STRETCH, RISE, FALL, CAP = 2.0, 10.0, 0.6, 0.1, 2.0
+#: Part of its threshold at which a force is looked at: what is made of it has a test of its own (`haltere.diagnosis.model_faults`).
+LOOK = 0.5
 #: What is left of the largest moment of late, a block.
 HARD_FOR = 0.98
 #: Forces are compared in the wind of so long ago [s].
@@ -253,7 +255,7 @@ def listen(s: Any, prm: Any) -> bool:
             continue
         if deaf:
             continue
-        factor = max(1.0, BEYOND_USUAL * p.usual[i])
+        factor = max(1.0, BEYOND_USUAL * p.usual[i]) * (LOOK if i < FORCES else 1.0)
         if over > factor and p.t_alarm[i] == 0.0:
             size = size_of(p, i, rho, dt)
             if abs(size) > (prm.diagnosis_force if i < FORCES else prm.diagnosis_moment):

@@ -4,12 +4,14 @@ A force of the model, or an accelerometer's, is fixed in the body and along one 
 frame while the vehicle turns (theory.md §5.5, rule 5), and is in all of the force that the model makes of the velocity through the air:
 also along the thrust axis, by translational lift and inflow. The wind is held as it was before the change, since the filter's own follows.
 Each is a small filter on the same blocks, with what the model is off by for seconds as states of its own; its misfit is the sum of the
-squares of its innovations, which is that of its best fit and of how far this is from what was to be expected. That a wind may come from
-everywhere is not held against it: what it explains along the axis of a force it explains as well.
+squares of its innovations, which is that of its best fit and of how far this is from what was to be expected. A wind along the axis of a
+force explains as well as the force. That it may come from everywhere, and would have come along an axis by chance, is kept beside
+(`by_chance`): it is what tells in flight, and nothing to convict on where a vehicle hovers.
 """
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 from haltere._jit import constant, jit
@@ -17,10 +19,12 @@ from haltere.core.rotation import Vec, dcm, tmat_vec
 from haltere.diagnosis.drifts import LASTS, lasting, walk_of
 from haltere.vehicle.linear import linear
 
-__all__ = ["WIND", "best", "follow", "start"]
+__all__ = ["WIND", "best", "by_chance", "follow", "start"]
 
 #: 1 sigma of a force and of a change of wind before anything is known [m/s^2, m/s]; how the wind walks meanwhile [m/s/sqrt(s)].
 FORCE, CHANGE, WALK = 1.5, 4.0, 0.1
+#: A vehicle that was slower [m/s] and turned by less [rad] hovers.
+FAST, TURNED = 1.0, 0.2
 #: Least 1 sigma of what a level before the change is off by [m/s^2].
 LEAST = 0.03
 ZERO: Vec = (0.0, 0.0, 0.0)
@@ -33,7 +37,8 @@ def start(s: Any) -> None:
     p = s.pairs[0]
     p.trial, p.both = 1, 0
     for i in range(4):
-        p.misfit[i] = 0.0
+        p.misfit[i], p.chance[i] = 0.0, 0.0
+    p.moved, p.heading = 0.0, yaw(s)
     for i in range(STATES):
         p.blown[i] = 0.0
         for j in range(STATES):
@@ -46,6 +51,13 @@ def start(s: Any) -> None:
     for i in range(2):
         p.wind[i] = p.m_wind[p.mark, i]
         p.blown_P[i, i] = CHANGE * CHANGE
+
+
+@jit
+def yaw(s: Any) -> float:
+    """Heading [rad]."""
+    C = dcm((s.q[0], s.q[1], s.q[2], s.q[3]))
+    return math.atan2(C[1][0], C[0][0])
 
 
 @jit
@@ -75,18 +87,24 @@ def follow(s: Any, dt: float) -> None:
     f_0 = linear(m, s.speed, s.spin_up, through_air(s, p.wind[0], p.wind[1]), ZERO, ZERO, p.ratio)[0]
     r = (left(p, 0, f_0[0] - f_now[0]), left(p, 1, f_0[1] - f_now[1]), left(p, 2, f_0[2] - f_now[2]))
     R = (white(s, 0, dt), white(s, 1, dt), white(s, 2, dt))
+    change = yaw(s) - p.heading
+    turned = abs(math.atan2(math.sin(change), math.cos(change)))
+    p.moved = max(p.moved, math.sqrt(s.v[0] * s.v[0] + s.v[1] * s.v[1]) / FAST, turned / TURNED)
     for i in range(FORCES):  # with a force along the axis, and with no more than what the model is off by
         q = walk_of(s, i) * dt
         p.push_var[i] += q
         S = p.push_var[i] + R[i]
         x = r[i] - p.push[i]
         p.pushed[i] += x * x / S
+        p.chance[i] -= math.log(S)
         p.push[i] += p.push_var[i] / S * x
         p.push_var[i] *= R[i] / S
         p.off_var[i] += q
         S = p.off_var[i] + R[i]
         x = r[i] - p.off[i]
         p.unpushed[i] += x * x / S
+        p.chance[i] += math.log(S)
+        p.chance[WIND] -= math.log(S)
         p.off[i] += p.off_var[i] / S * x
         p.off_var[i] *= R[i] / S
         p.blown_P[2 + i, 2 + i] += q
@@ -105,10 +123,21 @@ def follow(s: Any, dt: float) -> None:
             p.gain[j] = p.blown_P[j, 0] * h_n + p.blown_P[j, 1] * h_e + p.blown_P[j, 2 + i]
         S = h_n * p.gain[0] + h_e * p.gain[1] + p.gain[2 + i] + R[i]
         p.misfit[WIND] += x * x / S
+        p.chance[WIND] += math.log(S)
         for j in range(STATES):
             p.blown[j] += p.gain[j] / S * x
             for k in range(STATES):
                 p.blown_P[j, k] -= p.gain[j] * p.gain[k] / S
+
+
+@jit
+def by_chance(s: Any, a: int) -> float:
+    """What goes against a wind beside its misfit, that it would look like a force along axis ``a`` by chance, in the same measure.
+
+    Twice the logarithm of the ratio of what of the two priors is left.
+    """
+    p = s.pairs[0]
+    return float(p.chance[WIND] + p.chance[a])
 
 
 @jit

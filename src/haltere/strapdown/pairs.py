@@ -113,6 +113,9 @@ def pairs() -> np.dtype[np.void]:
                 ("trial", "i8"),
                 ("both", "i8"),  # 1: that it is one or the other was told
                 ("misfit", "f8", 4),
+                ("chance", "f8", 4),
+                ("moved", "f8"),  # most of what is no hover any more, speed or turn since, and the heading then
+                ("heading", "f8"),
                 ("pushed", "f8", 3),
                 ("unpushed", "f8", 3),
                 ("push", "f8", 3),
