@@ -18,10 +18,11 @@ from haltere.aids import compass
 from haltere.aids.compass import OUT_TURN
 from haltere.aids.record import E_FAULT, E_OVER, E_SUSPECT, NO_SENSOR, event_since
 from haltere.diagnosis import doubt
+from haltere.diagnosis.drifts import LASTS, forget_means, lasting
 from haltere.diagnosis.pairs import BLOCK, CALM_ENOUGH, calm_again, change, listen, shift_bias, would_show
 from haltere.diagnosis.rate_step import began, shape
 from haltere.diagnosis.stand_in import density_of_noise, mark_before, offset_variance
-from haltere.diagnosis.wind_or_force import WIND, best, follow, start
+from haltere.diagnosis.wind_or_force import WIND, best, by_chance, follow, start
 from haltere.filter.signatures import ACCEL, SLOTS, clear
 from haltere.strapdown.propagate import gusts, inject
 
@@ -44,21 +45,27 @@ EARLY, COLLECT, WAIT, LONGER = 0.08, 0.3, 6.0, 2.0
 COMPARED = 2.5
 #: By how much a hypothesis must explain better, in twice the log likelihood; what a signature is off by itself, and least 1 sigma.
 MARGIN, LIKE, LEAST_M, LEAST_F = 9.0, 0.2, 0.15, 0.04
+#: A change that is the wind beyond doubt, soon; what a force must explain better than what the model is off by in this flight, and less
+#: than what it is not looked at any longer.
+SURE, WORTH, LITTLE = 40.0, 24.0, 6.0
 #: Two rotors that explain alike within the first are both named, within the second they are looked at for longer.
 NEARLY, UNLIKE = 1.0, 3.0
 #: A moment that has lasted for so long [s] before its alarm is dated anew.
 OLD = 0.5
 #: Least change of a rotor's thrust that is a fault.
 LEAST_ROTOR = 0.015
-#: 1 sigma of what a rotor that has lost thrust has lost of its torque, beside that.
-TORQUE = 0.1
+#: 1 sigma of what a rotor that has lost thrust has lost of its torque, beside that; and of the part of it that may be: half of it ± that.
+TORQUE, SOME = 0.1, 0.5
 #: Air that is still: the wind is below this [m/s]; for so long in the air before, in which the wind was learnt [s]; how many sigma of gusts
 #: a force must exceed.
 STILL, STILL_FOR, BEYOND_GUSTS = 1.5, 15.0, 4.0
 #: Vertical gusts beside horizontal ones; drag by wind that an unknown one may have [1/s].
 DOWN, TYPICAL_DRAG = 0.5, 0.3
-#: Statistics of the bank for silence with power: 99 %; and what must speak against a fault of the size, in twice the log likelihood.
-POWER, AGAINST = 2.33, 16.0
+#: What must speak against an accelerometer's fault of the size, in twice the log likelihood: that one of size² D = d would do so by chance
+#: has the probability Φ(-(d + 16)/(2 √d)), at most that of four sigma.
+AGAINST = 16.0
+#: How long forces are not listened to [s]: after a verdict, after a change of the wind, and where there was nothing.
+DEAF, SOON, BRIEFLY = 5.0, 1.5, 0.5
 #: A fault is over when the change is its reverse within this part.
 REVERSE = 0.4
 #: A step of the gyro and the onset of what turned the compass are one if so near [s]; part of a step that its size may be off by.
@@ -152,7 +159,7 @@ def judge(s: Any, prm: Any) -> None:
     since = s.t - p.t_first
     if len(s.bank) > 0 and s.bank[0].healed != p.healed:  # an inertial fault was named meanwhile: it explains this
         settle(s)
-        p.t_across = s.t
+        p.t_across, p.t_deaf = s.t, s.t + DEAF
         return
     if since < COLLECT:
         return
@@ -168,7 +175,7 @@ def judge(s: Any, prm: Any) -> None:
         if of_moments(s, prm) or since > LONGER:
             settle(s)
     elif late:  # a force was looked at, and there is something new: it alarms again by itself
-        settle_forces(s)
+        settle_forces(s, SOON)
     elif p.t_alarm[0] != 0.0 or p.t_alarm[1] != 0.0 or p.t_alarm[T] != 0.0:
         of_forces(s, prm, since)
     else:
@@ -180,6 +187,7 @@ def settle(s: Any) -> None:
     """End an alarm; levels as they are now are what is usual from here on."""
     p = s.pairs[0]
     p.t_first, p.trial, p.n_blocks, p.t_calm = 0.0, 0, 0, s.t
+    forget_means(p)
     for i in range(6):
         calm_again(s, i)
         p.told_size[i] = 0.0
@@ -187,10 +195,11 @@ def settle(s: Any) -> None:
 
 
 @jit
-def settle_forces(s: Any) -> None:
-    """The same of forces alone: rates are listened to as before."""
+def settle_forces(s: Any, deaf: float) -> None:
+    """The same of forces alone, which are not listened to for some seconds: rates are as before."""
     p = s.pairs[0]
-    p.t_first, p.trial, p.t_across = 0.0, 0, s.t
+    p.t_first, p.trial, p.t_across, p.t_deaf = 0.0, 0, s.t, s.t + deaf
+    forget_means(p)
     for i in range(6):
         if i < FORCES:
             calm_again(s, i)
@@ -274,8 +283,8 @@ def of_moments(s: Any, prm: Any) -> bool:
     m_p, s_p = moment_of(s, P)
     m_q, s_q = moment_of(s, Q)
     span = max(s.t - p.onset, EARLY)
-    lasting = density_of_noise(s, T) * min(1.0, p.scale[T]) + p.r[T] * BLOCK
-    f, s_f = change(s, T), math.sqrt(lasting / span + LEAST_F * LEAST_F)
+    f = p.mean_T - p.m_level[p.mark, T]
+    s_f = math.sqrt(p.r[T] / max(p.mean_n, 1.0) + lasting(s, T) * min(1.0, 2.0 * LASTS / span) + LEAST_F * LEAST_F)
     alarmed = (p.t_alarm[R] != 0.0) + (p.t_alarm[P] != 0.0) + (p.t_alarm[Q] != 0.0)
     for i in range(R, 6):  # a rate that steps and stays, and the other axes keep quiet
         if p.t_alarm[i] != 0.0 and alarmed == 1:
@@ -295,11 +304,14 @@ def of_moments(s: Any, prm: Any) -> bool:
         if den <= 0.0:
             continue
         d = (g[0] * m_r * weight[0] + g[1] * m_p * weight[1] + g[2] * f * weight[2]) / den
-        left = misfit(m_r, d * g[0], s_r) + misfit(m_p, d * g[1], s_p) + misfit(f, d * g[2], s_f)
+        left = misfit(m_r, d * g[0], s_r) + misfit(m_p, d * g[1], s_p) + misfit(f, d * g[2], s_f) + off_torque(s, k, d, m_q)
         if left < least:
             first, other, least, second, thrust = k, first, left, least, d
         elif left < second:
             other, second = k, left
+    if first >= 0:  # torque tells rotors apart; it does not speak against all of them
+        of_torque = off_torque(s, first, thrust, m_q)
+        least, second = least - of_torque, second - of_torque
     nothing = (m_r / s_r) * (m_r / s_r) + (m_p / s_p) * (m_p / s_p) + (f / s_f) * (f / s_f)
     alone = (nothing - (m_r / s_r) * (m_r / s_r), nothing - (m_p / s_p) * (m_p / s_p), nothing)
     spread = (m_q / s_q) * (m_q / s_q)
@@ -347,6 +359,17 @@ def of_moments(s: Any, prm: Any) -> bool:
 
 
 @jit
+def off_torque(s: Any, k: int, thrust: float, m_q: float) -> float:
+    """How badly a yawing moment goes with a rotor's thrust that is off by a part: torque is off by as much, or not at all."""
+    p, m = s.pairs[0], s.model[0]
+    g = m.k[5, 0] * m.yaw[k] * s.speed[k] * s.speed[k] * p.ratio
+    span = max(s.t - p.onset, EARLY)
+    sd2 = 2.0 * p.r[Q] / (span * span) + density_of_noise(s, Q) / span + offset_variance(s, Q) + HARD * HARD * p.m[2] * p.m[2]
+    x = m_q - SOME * thrust * g
+    return float(x * x / (sd2 + SOME * SOME * thrust * thrust * g * g))
+
+
+@jit
 def misfit(x: float, y: float, sd: float) -> float:
     """Square of a difference in sigma, of what a signature says but in part."""
     return (x - y) * (x - y) / (sd * sd + LIKE * LIKE * y * y)
@@ -368,11 +391,9 @@ def silent(s: Any, prm: Any, a: int, size: float) -> int:
     j = (ACCEL + a) * SLOTS + slot
     h = prm.diagnosis_threshold
     level = b.num[j] * b.num[j] / max(b.den[j], 1e-9)
-    root = math.sqrt(h) + POWER
     if level > h:
         return -1
-    gain = 2.0 * size * b.num[j] - size * size * b.den[j]
-    return 1 if size * size * b.den[j] >= root * root and gain < -AGAINST else 0
+    return 1 if 2.0 * size * b.num[j] - size * size * b.den[j] < -AGAINST else 0
 
 
 @jit
@@ -403,32 +424,35 @@ def of_forces(s: Any, prm: Any, since: float) -> None:
             start(s)
             return
     if p.still < 0:  # wind, whatever else
-        settle_forces(s)
+        settle_forces(s, SOON)
         return
     a = best(s)
     gap = p.misfit[WIND] - p.misfit[a]
-    others = 1e18
+    others, worth = 1e18, p.unpushed[a] - p.pushed[a]  # against another axis, and against no fault at all
     for i in range(FORCES):
         if i != a:
             others = min(others, p.misfit[i] - p.misfit[a])
-    if gap < -MARGIN or (gap < 0.0 and since > COMPARED):
-        settle_forces(s)
-        return
     size = p.push[a]
-    if since > 1.0 and abs(size) < max(0.5 * prm.diagnosis_force, BEYOND_GUSTS * by_gusts(s, prm, a)):  # gusts, or gone by itself
-        settle_forces(s)
+    if since > COMPARED and gap < (-MARGIN if since > WAIT else -SURE):
+        settle_forces(s, SOON)
+        return
+    small = abs(size) < max(0.5 * prm.diagnosis_force, BEYOND_GUSTS * by_gusts(s, prm, a))
+    if since > 1.0 and (small or (worth < LITTLE and since > 1.5)):  # gusts, chance, or gone by itself
+        settle_forces(s, BRIEFLY)
         return
     if len(s.bank) > 0 and s.bank[0].alarm != 0 and since < WAIT:  # an inertial fault is about to be named
         return
     quiet = silent(s, prm, a, size)
-    windy = gap < MARGIN or len(s.wind) == 0
-    if (windy and since < COMPARED) or (others < MARGIN and since < COMPARED):
+    decided = gap + (by_chance(s, a) if p.moved > 1.0 else 0.0)  # in hover a wind along an axis is no chance to convict on
+    windy = decided < (MARGIN if since < WAIT else 0.5 * MARGIN) or len(s.wind) == 0
+    if worth > WORTH and others > MARGIN and not windy and quiet == 1:
+        conclude(s, a, MODEL + a, size, 0.05, UP << a, E_FAULT)
+        settle_forces(s, DEAF)
         return
-    if quiet == 1 and abs(size) > BEYOND_GUSTS * by_gusts(s, prm, a):
-        candidates = (UP << a) | ((UP << B_WIND) if windy else 0)
-        conclude(s, a, MODEL + a, size, 0.05, candidates, E_SUSPECT if windy else E_FAULT)
-        settle_forces(s)
-    elif since > WAIT:
-        if quiet == 0 and not windy:  # three that it may be are no verdict
+    if worth > WORTH and since > COMPARED and gap > -MARGIN and quiet == 1 and p.both == 0:  # both, until the vehicle has turned
+        p.both = 1
+        conclude(s, a, MODEL + a, size, 0.05, (UP << a) | (UP << B_WIND), E_SUSPECT)
+    if since > WAIT:
+        if worth > WORTH and quiet == 0 and not windy:  # three that it may be are no verdict
             conclude(s, a, MODEL + a, size, 0.05, (UP << a) | (UP << (B_ACCEL + a)), E_SUSPECT)
-        settle_forces(s)
+        settle_forces(s, SOON)

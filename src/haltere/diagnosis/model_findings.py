@@ -42,12 +42,17 @@ def of_the_model(kind: str, record: np.void, events: list[dict[str, Any]]) -> di
     else:
         unit = "m/s²" if detail - int(MODEL) < 3 else "rad/s²"
         what = f"measured less modelled changes by {size:+.3g} ± {float(record['sd']):.2g} {unit} and stays"
-    events.append({
+    out = {
         "sensor": sensor, "axis": axis, "kind": "thrust" if rotor else "bias", "t_onset": float(record["onset"]),
         "t_detected": float(record["seen"]), "t_isolated": t if kind == "fault" else None, "t_recovered": None,
         "candidates": candidates, "statistic": float(record["value"]), "threshold": float(record["threshold"]),
         "evidence": f"{said}; {', '.join(quiet)} silent; {what}",
-    })  # fmt: skip
+    }  # fmt: skip
+    before = next((e for e in reversed(events) if (e["sensor"], e["axis"], e["t_onset"]) == (sensor, axis, out["t_onset"])), None)
+    if before is not None and before["t_isolated"] is None and before["t_recovered"] is None:  # a set that is decided now
+        events[events.index(before)] = out
+    else:
+        events.append(out)
     return None
 
 

@@ -15,6 +15,7 @@ from typing import Any
 from haltere._jit import constant, jit, where
 from haltere.aids.air import wind_n
 from haltere.core.rotation import Vec, dcm, tmat_vec
+from haltere.diagnosis.drifts import LASTS, MEAN, forget_means, lasting, shift_means, take_means, walk_of
 from haltere.diagnosis.stand_in import across, density_of_noise, mark_before, offset_variance
 from haltere.filter.windows import empty, take
 from haltere.strapdown.pairs import LATELY, MARKS
@@ -39,25 +40,27 @@ __all__ = [
 BLOCK, MARK = 0.01, 0.25
 #: Biases are held for so long [s]; blocks until a chain is known; time in the air before [s].
 HELD, WARM, AIRBORNE = 5.0, 200, 2.0
-#: An offset walks by its 1 sigma in this time [s]; 1 sigma of one that begins anew, in those.
+#: A moment's offset walks by its 1 sigma in this time [s]; 1 sigma of one that begins anew, of a force and of a moment, in its own.
 WALK, ANEW, ANEW_MOMENT = 5.0, 10.0, 30.0
+#: Most correlation of neighbours that is taken out.
+MOST_RHO = 0.9
 #: Memory of what innovations come to, and of the noise of a block, in blocks; how far a lone one may move it.
 LEARN, NOISE, LONE = 2000.0, 500.0, 9.0
 #: And the shortest of the first, at the beginning.
 EARLY_LEARN = 100.0
 #: How fast the noise of a chain follows the flight, a part a block, at first and later; its bounds, over the vehicle file's.
 QUICK, SETTLED, LEAST_SCALE, MOST_SCALE = 0.2, 0.02, 0.01, 4.0
-#: Most correlation of neighbours that is taken out.
-MOST_RHO = 0.9
 #: As in `haltere.diagnosis.inertial`: over how many usual ones a threshold is, stretch [s], how fast that is learnt, its bound.
 BEYOND_USUAL, STRETCH, RISE, FALL, CAP = 2.0, 10.0, 0.6, 0.1, 2.0
+#: Part of its threshold at which a force is looked at: what is made of it has a test of its own (`haltere.diagnosis.model_faults`).
+LOOK = 0.5
 #: What is left of the largest moment of late, a block.
 HARD_FOR = 0.98
 #: Forces are compared in the wind of so long ago [s].
 LAG = 1.0
 #: Memory of gusts [s].
 STIR = 20.0
-#: A wind that changed, or was taken for one, is found again and again for so long [s]: forces are not judged meanwhile.
+#: For so long [s] after a verdict on forces they are held against no accelerometer.
 FOLLOWS = 5.0
 #: Least part of the gusts expected that are taken for there.
 CALMEST = 0.2
@@ -81,6 +84,8 @@ def calm_again(s: Any, i: int) -> None:
     v = offset_variance(s, i) * (ANEW * ANEW if i < FORCES else ANEW_MOMENT * ANEW_MOMENT)
     p.P[i, 0], p.P[i, 1], p.P[i, 2] = v if i < FORCES else 1.0, 0.0, v
     p.z[i], p.t_alarm[i] = 0.0, 0.0
+    if i < FORCES:
+        p.P[i, 2], p.drift[i] = lasting(s, i), 0.0
     empty(p.w[i])
 
 
@@ -93,7 +98,9 @@ def shift_bias(s: Any, i: int, change: float) -> None:
     p.before[i] -= change
     for k in range(MARKS):
         p.m_level[k, i] -= change
-    if i >= FORCES:
+    if i < FORCES:
+        shift_means(p, i, change)
+    else:
         for k in range(LATELY):
             p.lately[k, i - FORCES] -= change
 
@@ -133,7 +140,8 @@ def use_bias(s: Any) -> None:
 def restart(s: Any) -> None:
     """Forget chains and alarms: on the ground, without rotor speeds, after alignment."""
     p = s.pairs[0]
-    p.t_across = -1e9
+    p.t_across, p.t_deaf = -1e9, -1e9
+    forget_means(p)
     p.n, p.span, p.t_first, p.t_bias, p.stir, p.calm, p.n_stir, p.n_blocks, p.trial = 0.0, 0.0, 0.0, -1e9, 1.0, 1.0, 0.0, 0, 0
     p.hard = 0.0
     p.out, p.t_healed = s.compass.out, -1e9
@@ -153,13 +161,20 @@ def chain(s: Any, i: int, y: float, dt: float) -> float:
     """Take a block's residual into the chain of a pair; the innovation."""
     p = s.pairs[0]
     q = offset_variance(s, i) / WALK * dt * p.scale[i]
-    if i < FORCES:
-        p.P[i, 0] += q
-        S = p.P[i, 0] + p.r[i]
-        k = p.P[i, 0] / S
-        e = y - p.level[i]
+    if i < FORCES:  # its drift is what it is off by for a second
+        keep = 1.0 - dt / LASTS
+        p.drift[i] *= keep
+        p.P[i, 0] += walk_of(s, i) * dt
+        p.P[i, 1] *= keep
+        p.P[i, 2] = keep * keep * p.P[i, 2] + lasting(s, i) * (1.0 - keep * keep)
+        S = p.P[i, 0] + 2.0 * p.P[i, 1] + p.P[i, 2] + p.r[i]
+        k, g = (p.P[i, 0] + p.P[i, 1]) / S, (p.P[i, 1] + p.P[i, 2]) / S
+        e = y - p.level[i] - p.drift[i]
         p.level[i] += k * e
-        p.P[i, 0] *= 1.0 - k
+        p.drift[i] += g * e
+        p.P[i, 0] -= k * k * S
+        p.P[i, 1] -= k * g * S
+        p.P[i, 2] -= g * g * S
     else:
         p.level[i] += dt * p.drift[i]
         p.P[i, 0] += dt * (2.0 * p.P[i, 1] + dt * p.P[i, 2]) + density_of_noise(s, i) * dt * p.scale[i]
@@ -179,10 +194,14 @@ def chain(s: Any, i: int, y: float, dt: float) -> float:
 
 @jit
 def size_of(p: Any, i: int, rho: float, dt: float) -> float:
-    """Size of what is in the window that says most: a force, or a moment from the innovations it makes in a settled chain."""
+    """Size of what alarms: a force, or a moment from the innovations it makes in a settled chain."""
     w = p.w[i]
     e = w.average[0] * math.sqrt((1.0 + rho) / (1.0 - rho) * p.c0[i])
-    return e if i < FORCES else e * p.P[i, 0] / p.r[i] / dt  # a settled chain follows with its gain, P/r, of the innovation a block
+    if i >= FORCES:
+        return float(e * p.P[i, 0] / p.r[i] / dt)  # a settled chain follows with its gain, P/r, of the innovation a block
+    k = mark_before(p, p.t_lately[(p.n_lately - 1) % LATELY] - w.window * BLOCK - 2.0 * BLOCK)
+    found = p.level[i] + p.drift[i] - p.m_level[k, i] if k >= 0 else e  # soon it is in the innovations, later in the chain
+    return float(e if abs(e) > abs(found) else found)
 
 
 @jit
@@ -195,11 +214,14 @@ def listen(s: Any, prm: Any) -> bool:
     p.n_blocks += 1
     learns = p.t_first == 0.0
     blown = by_lag(s)
+    change = (dot_row(p, 0, blown), dot_row(p, 1, blown), dot_row(p, 2, blown))
+    if learns and p.n_blocks > WARM:
+        take_means(s, (p.total[0] / n + change[0], p.total[1] / n + change[1], p.total[2] / n + change[2]))
     for i in range(AXES):
         y = p.total[i] / n
         p.total[i], p.residual[i] = 0.0, y
         if i < FORCES:
-            y += p.by_v[0, i, 0] * blown[0] + p.by_v[0, i, 1] * blown[1] + p.by_v[0, i, 2] * blown[2]
+            y += change[i]
         if first:
             p.level[i] = y
             p.before[i] = y
@@ -219,28 +241,34 @@ def listen(s: Any, prm: Any) -> bool:
             x = min(max(z * p.z[i], -LONE * p.c0[i]), LONE * p.c0[i])
             p.c0[i] += rate * (min(z * z, LONE * p.c0[i]) - p.c0[i])
             p.c1[i] += rate * (x - p.c1[i])
-            # neighbours that are alike: the chain is too slow for what the model leaves; that alternate: too quick
-            quick = min(QUICK, max(SETTLED, EARLY_LEARN * rate * QUICK))
-            p.scale[i] = min(max(p.scale[i] * (1.0 + quick * x / p.c0[i]), LEAST_SCALE), 1.0 if i < FORCES else MOST_SCALE)
+            if i >= FORCES:  # neighbours that are alike: the chain is too slow for what the model leaves; that alternate: too quick
+                quick = min(QUICK, max(SETTLED, EARLY_LEARN * rate * QUICK))
+                p.scale[i] = min(max(p.scale[i] * (1.0 + quick * x / p.c0[i]), LEAST_SCALE), MOST_SCALE)
         p.z[i] = z
         rho = min(max(p.c1[i] / p.c0[i], 0.0), MOST_RHO)
         glr = take(p.w[i], (z / math.sqrt(p.c0[i]), 0.0, 0.0), 1, rho)
         over = glr / prm.diagnosis_pair_threshold
-        p.peak[i] = max(p.peak[i], over)
+        deaf = i < FORCES and p.t_first == 0.0 and s.t < p.t_deaf
+        if not deaf:
+            p.peak[i] = max(p.peak[i], over)
         if p.on[3 + i if i < FORCES else i - 3] == 1 or p.n_blocks < WARM or s.t - p.t_flying < AIRBORNE:
             continue
-        if i < FORCES and p.t_first == 0.0 and s.t - p.t_across < FOLLOWS:
+        if deaf:
             continue
-        factor = max(1.0, BEYOND_USUAL * p.usual[i])
+        factor = max(1.0, BEYOND_USUAL * p.usual[i]) * (LOOK if i < FORCES else 1.0)
         if over > factor and p.t_alarm[i] == 0.0:
             size = size_of(p, i, rho, dt)
             if abs(size) > (prm.diagnosis_force if i < FORCES else prm.diagnosis_moment):
                 p.t_alarm[i], p.told_size[i], p.t_hint[i] = s.t, size, s.t
                 if p.t_first == 0.0:
                     p.t_first, p.onset = s.t, s.t - p.w[i].window * BLOCK
+                    p.mean_n, p.mean_T = 0.0, 0.0
                     p.statistic, p.threshold = glr, factor * prm.diagnosis_pair_threshold
                     p.mark = mark_before(p, p.onset - 2.0 * BLOCK)
                     p.healed = s.bank[0].healed if len(s.bank) > 0 else 0
+    if p.t_first != 0.0:
+        p.mean_n += 1.0
+        p.mean_T += (p.residual[2] + change[2] - p.mean_T) / p.mean_n
     p.hard *= HARD_FOR
     for i in range(FORCES):
         p.hard = max(p.hard, abs(p.m[i]))
@@ -258,6 +286,12 @@ def listen(s: Any, prm: Any) -> bool:
     if s.t >= p.t_mark and p.t_first == 0.0 and p.n_blocks > WARM // 2:
         remember(s, prm)
     return p.t_first != 0.0
+
+
+@jit
+def dot_row(p: Any, i: int, v: Vec) -> float:
+    """What a velocity through the air more makes of the force along an axis [m/s^2]."""
+    return float(p.by_v[0, i, 0] * v[0] + p.by_v[0, i, 1] * v[1] + p.by_v[0, i, 2] * v[2])
 
 
 @jit
@@ -285,6 +319,8 @@ def remember(s: Any, prm: Any) -> None:
     W = wind_n(s)
     p.m_wind[k, 0], p.m_wind[k, 1] = W[0], W[1]
     p.lag = mark_before(p, s.t - LAG)
+    if p.lag >= 0 and p.m_t[p.lag] < p.t_across:  # levels begin anew with a verdict: in the wind of then
+        p.lag = -1
     if len(s.wind) > 0 and not across(s):
         gust, _ = gusts(s, prm)
         blown = 0.0
@@ -309,15 +345,18 @@ def change(s: Any, i: int) -> float:
 def would_show(s: Any, prm: Any, i: int, size: float) -> bool:
     """Whether a step of a pair [m/s^2, rad/s] would have set off its detector, with a power of 99 %, if it came while that listened.
 
-    A chain follows a step with its gain K, so that its innovations are size (1 - K)^n, with the sum of squares size²/(2K - K²).
+    A chain of a rate follows a step with its gain K, so that its innovations are size (1 - K)^n, with the sum of squares size²/(2K - K²).
+    Of a force a second says size² over the variance of a mean over it.
     """
     p = s.pairs[0]
     if p.flying == 0 or p.n_blocks < WARM or s.t - p.t_flying < AIRBORNE or p.sd[i] <= 0.0:
         return False
+    root = math.sqrt(prm.diagnosis_pair_threshold * max(1.0, BEYOND_USUAL * p.usual[i])) + POWER
+    if i < FORCES:
+        return FOUND * size * size / (p.r[i] * BLOCK + MEAN * lasting(s, i) + p.P[i, 0]) > root * root
     K = p.P[i, 0] / (p.sd[i] * p.sd[i])
     rho = min(max(p.c1[i] / p.c0[i], 0.0), MOST_RHO)
     white = p.c0[i] * (1.0 + rho) / (1.0 - rho)
-    root = math.sqrt(prm.diagnosis_pair_threshold * max(1.0, BEYOND_USUAL * p.usual[i])) + POWER
     return FOUND * size * size / (white * (2.0 * K - K * K)) > root * root
 
 

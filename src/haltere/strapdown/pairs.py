@@ -58,12 +58,20 @@ def pairs() -> np.dtype[np.void]:
                 ("n", "f8"),
                 ("span", "f8"),
                 ("t_block", "f8"),
-                # chain of each pair: level (of a force its offset, of a moment the rate less `turn`), drift of it, covariance
+                # chain of each pair: of a force its offset and what it is off by for a second beside, of a moment the rate less `turn` and
+                # its drift; covariance
                 ("level", "f8", 6),
                 ("drift", "f8", 6),
                 ("P", "f8", (6, 3)),
                 ("sd", "f8", 6),
                 ("scale", "f8", 6),  # noise of the model in this flight over that of the vehicle file, in variances
+                # what forces are off by for a second: sum of residuals, their number, mean before and whether there is one, squares, how many
+                ("slow_sum", "f8", 3),
+                ("slow_n", "f8"),
+                ("slow_mean", "f8", 3),
+                ("slow_known", "i8"),
+                ("slow_square", "f8", 3),
+                ("slow_count", "f8"),
                 ("n_blocks", "i8"),
                 ("t_calm", "f8"),  # when the chains began anew last
                 # innovations: variance, product of neighbours, both learnt, from how many; measurement variance of a block
@@ -87,8 +95,11 @@ def pairs() -> np.dtype[np.void]:
                 ("statistic", "f8"),
                 ("threshold", "f8"),
                 ("mark", "i8"),
+                ("mean_T", "f8"),  # mean residual along the thrust axis since then, and of how many blocks
+                ("mean_n", "f8"),
                 ("t_hint", "f8", 6),  # last alarm of each pair, whatever came of it
                 ("t_across", "f8"),  # last verdict on forces was pending
+                ("t_deaf", "f8"),  # until when forces are not listened to
                 ("t_step", "f8", 3),  # onset of the last step of a gyro axis that the rotors do not explain, and its size [rad/s]
                 ("step", "f8", 3),
                 ("out", "i8"),  # cause for which the compass was not heard, at the last block
@@ -97,15 +108,25 @@ def pairs() -> np.dtype[np.void]:
                 ("t_lately", "f8", int(LATELY)),
                 ("n_lately", "i8"),
                 ("lag", "i8"),  # mark of the wind that forces are compared in
-                # trial of what a change of force is: of the model along x, y, z, or wind; misfits, sizes with variances, change of the
-                # wind [m/s] with its covariance (nn, ne, ee), wind before
+                # trial of what a change of force is: of the model along x, y, z, or wind; misfits, of an axis with a force and without,
+                # sizes and what the model is off by with variances, wind before
                 ("trial", "i8"),
+                ("both", "i8"),  # 1: that it is one or the other was told
                 ("misfit", "f8", 4),
+                ("chance", "f8", 4),
+                ("moved", "f8"),  # most of what is no hover any more, speed or turn since, and the heading then
+                ("heading", "f8"),
+                ("pushed", "f8", 3),
+                ("unpushed", "f8", 3),
                 ("push", "f8", 3),
                 ("push_var", "f8", 3),
-                ("blown", "f8", 2),
-                ("blown_var", "f8", 3),
+                ("off", "f8", 3),
+                ("off_var", "f8", 3),
                 ("wind", "f8", 2),
+                # change of the wind north and east [m/s] and what the model is off by, covariance, room for a gain
+                ("blown", "f8", 5),
+                ("blown_P", "f8", (5, 5)),
+                ("gain", "f8", 5),
                 ("healed", "i8"),
                 ("healed_out", "i8"),
                 ("t_healed", "f8"),
