@@ -61,7 +61,7 @@ SUDDEN = 0.5
 LASTS = 1.2
 #: By how much a name must exceed the others; and for an axis of the gyro against that of the accelerometer which looks most like it.
 MARGIN, MARGIN_ALIKE = 9.0, 16.0
-#: What it says for a gyro axis that the raw samples show its step; margins as a part of the statistic, since responses are linear and
+#: What it says for an axis that the raw samples show its step, or the rotors do; margins as a part of the statistic, since responses are linear and
 #: onsets on a grid.
 SHOWN, LINEAR = 25.0, 0.02
 #: How sure [sigma] it must be that a fault is more than such a change before it is told.
@@ -295,6 +295,9 @@ def weigh(s: Any, prm: Any) -> tuple[int, float]:
         b.level[F_COMPASS], b.fault[F_COMPASS], b.slot[F_COMPASS] = turned, YAW, b.slot[VERTICAL]
     for g in range(F_ACCEL):
         if b.beyond[g] > 0.5 and (in_samples(s, g) or pairs.hinted(s, g, b.onset[b.slot[g]]) >= 0.0):
+            b.level[g] += SHOWN
+    for g in range(F_ACCEL, F_VELOCITY):  # forces say so in still air alone
+        if b.beyond[g] > 0.5 and b.fault[g] < GYRO_RAMP and pairs.hinted(s, g, b.onset[b.slot[g]]) >= 0.0:
             b.level[g] += SHOWN
     lead, ratio = 0, 0.0
     for g in range(N_FAMILIES):

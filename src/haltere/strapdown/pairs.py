@@ -9,12 +9,14 @@ import numpy as np
 from haltere._jit import constant
 from haltere.filter.windows import windows
 
-__all__ = ["LATELY", "MARKS", "PAIR_WINDOW", "pairs"]
+__all__ = ["LATELY", "MARKS", "MATCHED", "PAIR_WINDOW", "pairs"]
 
 #: Longest window of the detectors in blocks of a hundredth of a second, in a plain number: it is a modulus.
 PAIR_WINDOW = constant(512)
 #: Blocks whose residuals of rate are kept.
 LATELY = constant(64)
+#: Blocks for which a step of a rate is looked for: a chain has followed it by then. In a plain number: it is a modulus.
+MATCHED = constant(24)
 #: Quarters of a second that the past of each pair is kept.
 MARKS = constant(40)
 
@@ -74,6 +76,11 @@ def pairs() -> np.dtype[np.void]:
                 ("r", "f8", 6),
                 ("before", "f8", 6),
                 ("w", windows(int(PAIR_WINDOW)), (6,)),
+                # of rates, a step at each of the last blocks: what it would be in the next innovation, sums of products and squares
+                ("expected", "f8", (3, int(MATCHED))),
+                ("agrees", "f8", (3, int(MATCHED))),
+                ("energy", "f8", (3, int(MATCHED))),
+                ("n_matched", "i8", 3),
                 # statistic over threshold: largest of this stretch and of the one before, what is usual
                 ("peak", "f8", 6),
                 ("waiting", "f8", 6),
