@@ -57,8 +57,9 @@ TORQUE = 0.1
 STILL, STILL_FOR, BEYOND_GUSTS = 1.5, 15.0, 4.0
 #: Vertical gusts beside horizontal ones; drag by wind that an unknown one may have [1/s].
 DOWN, TYPICAL_DRAG = 0.5, 0.3
-#: Statistics of the bank for silence with power: 99 %; and what must speak against a fault of the size, in twice the log likelihood.
-POWER, AGAINST = 2.33, 16.0
+#: Statistics of the bank for silence with power: 99 %; and what must speak against a fault of the size, in twice the log likelihood; by
+#: what part the size may be off.
+POWER, AGAINST, ABOUT = 2.33, 16.0, 0.3
 #: A fault is over when the change is its reverse within this part.
 REVERSE = 0.4
 #: A step of the gyro and the onset of what turned the compass are one if so near [s]; part of a step that its size may be off by.
@@ -371,7 +372,9 @@ def silent(s: Any, prm: Any, a: int, size: float) -> int:
     root = math.sqrt(h) + POWER
     if level > h:
         return -1
-    gain = 2.0 * size * b.num[j] - size * size * b.den[j]
+    likely = b.num[j] / max(b.den[j], 1e-9) * math.copysign(1.0, size)  # of about that size: a few blocks have told it
+    likely = math.copysign(min(max(likely, (1.0 - ABOUT) * abs(size)), (1.0 + ABOUT) * abs(size)), size)
+    gain = 2.0 * likely * b.num[j] - likely * likely * b.den[j]
     return 1 if size * size * b.den[j] >= root * root and gain < -AGAINST else 0
 
 

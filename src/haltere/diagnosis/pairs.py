@@ -256,12 +256,14 @@ def listen(s: Any, prm: Any) -> bool:
         rho = min(max(p.c1[i] / p.c0[i], 0.0), MOST_RHO)
         unit, last = z / math.sqrt(p.c0[i]), p.w[i].last[0] if p.w[i].n > 0 else 0.0
         glr = take(p.w[i], (unit, 0.0, 0.0), 1, rho)
-        window, enough = p.w[i].window, abs(size_of(p, i, rho, dt)) > (prm.diagnosis_force if i < FORCES else prm.diagnosis_moment)
+        size, window = size_of(p, i, rho, dt), p.w[i].window
+        enough, sign = abs(size) > (prm.diagnosis_force if i < FORCES else prm.diagnosis_moment), math.copysign(1.0, size)
         if i >= FORCES:
             gain = p.P[i, 0] / p.r[i]
             level, step, age = stepped(p, i - FORCES, (unit - rho * last) / math.sqrt(1.0 - rho * rho), min(gain, MOST_GAIN), rho)
             if level > glr:
                 glr, window, enough = level, age, abs(step) * math.sqrt(p.c0[i]) > prm.diagnosis_gyro
+                sign = math.copysign(1.0, step)
         over = glr / prm.diagnosis_pair_threshold
         p.peak[i] = max(p.peak[i], over)
         if p.on[3 + i if i < FORCES else i - 3] == 1 or p.n_blocks < WARM or s.t - p.t_flying < AIRBORNE:
@@ -270,7 +272,7 @@ def listen(s: Any, prm: Any) -> bool:
             continue
         factor = max(1.0, BEYOND_USUAL * p.usual[i])
         if over > factor and p.t_alarm[i] == 0.0 and enough:
-            p.t_alarm[i], p.told_size[i], p.t_hint[i] = s.t, size_of(p, i, rho, dt), s.t
+            p.t_alarm[i], p.told_size[i], p.t_hint[i], p.hint_sign[i] = s.t, size, s.t, sign
             if p.t_first == 0.0:
                 p.t_first, p.onset = s.t, s.t - window * BLOCK
                 p.statistic, p.threshold = glr, factor * prm.diagnosis_pair_threshold
@@ -357,20 +359,22 @@ def would_show(s: Any, prm: Any, i: int, size: float) -> bool:
 
 
 @jit
-def _hinted(s: Any, g: int, onset: float) -> float:
+def _hinted(s: Any, g: int, onset: float, size: float) -> float:
     p = s.pairs[0]
     if g >= FORCES and p.calm > CALM_ENOUGH:
         return -1.0
-    t = p.t_hint[3 + g if g < FORCES else g - 3]
-    return float(t) if t > onset - GRID and t < onset + GRID + HINTED else -1.0
+    i = 3 + g if g < FORCES else g - 3
+    t = p.t_hint[i]
+    return float(t) if t > onset - GRID and t < onset + GRID + HINTED and size * p.hint_sign[i] >= 0.0 else -1.0
 
 
 @jit
-def _no_hint(s: Any, g: int, onset: float) -> float:
+def _no_hint(s: Any, g: int, onset: float, size: float) -> float:
     return -1.0
 
 
-#: When the pair of gyro axis ``g`` = 0 to 2, or of accelerometer axis g - 3, alarmed for a fault that began at ``onset``; -1: never.
+#: When the pair of gyro axis ``g`` = 0 to 2, or of accelerometer axis g - 3, alarmed for a fault of the sign of ``size`` (0: of any) that
+#: began at ``onset``; -1: never.
 hinted = where("pairs", _hinted, _no_hint)
 
 
@@ -384,7 +388,7 @@ def _contradicted(s: Any, prm: Any, g: int, size: float, onset: float) -> bool:
         return False
     if i < FORCES and (s.t - p.t_across < FOLLOWS or p.calm > CALM_ENOUGH):
         return False
-    return would_show(s, prm, i, size) and hinted(s, g, onset) < 0.0
+    return would_show(s, prm, i, size) and hinted(s, g, onset, 0.0) < 0.0
 
 
 @jit

@@ -94,7 +94,8 @@ def pairs() -> np.dtype[np.void]:
                 ("statistic", "f8"),
                 ("threshold", "f8"),
                 ("mark", "i8"),
-                ("t_hint", "f8", 6),  # last alarm of each pair, whatever came of it
+                ("t_hint", "f8", 6),  # last alarm of each pair, whatever came of it, and its sign
+                ("hint_sign", "f8", 6),
                 ("t_across", "f8"),  # last verdict on forces was pending
                 ("t_step", "f8", 3),  # onset of the last step of a gyro axis that the rotors do not explain, and its size [rad/s]
                 ("step", "f8", 3),
