@@ -61,9 +61,11 @@ SUDDEN = 0.5
 LASTS = 1.2
 #: By how much a name must exceed the others; and for an axis of the gyro against that of the accelerometer which looks most like it.
 MARGIN, MARGIN_ALIKE = 9.0, 16.0
-#: What it says for a gyro axis that the raw samples show its step; margins as a part of the statistic, since responses are linear and
+#: What it says for an axis that the raw samples show its step, or the rotors do; margins as a part of the statistic, since responses are linear and
 #: onsets on a grid.
 SHOWN, LINEAR = 25.0, 0.02
+#: Part of a threshold that is enough where rotors alarmed by themselves for the same axis, sign and onset: both would have to be wrong.
+TWO_WITNESSES = 0.6
 #: How sure [sigma] it must be that a fault is more than such a change before it is told.
 CERTAIN = 3.0
 #: Changes that are no fault: slopes, as those of a bias over so long [s]; GNSS velocity [m/s], position [m], heading [rad], height [m].
@@ -293,9 +295,16 @@ def weigh(s: Any, prm: Any) -> tuple[int, float]:
     turned = min(turned, b.level[VERTICAL])  # a compass that turns as that gyro would have it explains as much of the heading
     if turned > b.level[F_COMPASS]:
         b.level[F_COMPASS], b.fault[F_COMPASS], b.slot[F_COMPASS] = turned, YAW, b.slot[VERTICAL]
-    for g in range(F_ACCEL):
-        if b.beyond[g] > 0.5 and (in_samples(s, g) or pairs.hinted(s, g, b.onset[b.slot[g]]) >= 0.0):
+    for g in range(F_VELOCITY):
+        if b.beyond[g] <= 0.5:
+            continue
+        hint = pairs.hinted(s, g, b.onset[b.slot[g]], b.num[b.fault[g] * SLOTS + b.slot[g]]) >= 0.0
+        if b.fault[g] >= GYRO_RAMP and g >= F_ACCEL:
+            hint = False  # forces tell of a step
+        if hint or in_samples(s, g):
             b.level[g] += SHOWN
+        if hint:
+            b.beyond[g] /= TWO_WITNESSES
     lead, ratio = 0, 0.0
     for g in range(N_FAMILIES):
         if b.level[g] > b.level[lead]:
@@ -376,7 +385,7 @@ def tell(s: Any, prm: Any, code: Any, g: int, candidates: int) -> None:
     if s.n_events > n:
         e = s.event[n]
         e.seen, e.size, e.sd, e.candidates = max(b.t_seen, b.onset[k]), b.num[j] / b.den[j], 1.0 / math.sqrt(b.den[j]), candidates
-        hint = pairs.hinted(s, g, b.onset[k]) if g < F_VELOCITY else -1.0  # the vehicle's model said so before
+        hint = pairs.hinted(s, g, b.onset[k], b.num[j]) if g < F_VELOCITY else -1.0  # the vehicle's model said so before
         if hint >= 0.0:
             e.seen = min(e.seen, hint)
         e.left = doubt.left(b, j, k) / max(b.num[j] * b.num[j] / b.den[j], 1e-9)

@@ -26,7 +26,7 @@ from haltere.aids.record import (
     WIND,
 )
 from haltere.core.earth import pressure_altitude
-from haltere.diagnosis.pairs import BLOCK
+from haltere.diagnosis.pairs import BLOCK, STEPS_TOO
 from haltere.errors import UsageError
 from haltere.estimators.air import air_from_vanes, given_wind, steady_wind
 from haltere.filter.windows import glr_level
@@ -177,7 +177,7 @@ def parameters(config: Config) -> NDArray[np.void]:
     record["horizon"] = horizon(config)
     record["covariance_interval"] = 0.1
     record["diagnosis_threshold"] = alarm_level(config.number("diagnosis.false_alarms"))
-    record["diagnosis_pair_threshold"] = glr_level(config.number("diagnosis.false_alarms"), 6.0 / BLOCK, 1)
+    record["diagnosis_pair_threshold"] = glr_level(config.number("diagnosis.false_alarms"), (3.0 + 3.0 * STEPS_TOO) / BLOCK, 1)
     return record
 
 

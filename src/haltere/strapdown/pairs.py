@@ -9,12 +9,14 @@ import numpy as np
 from haltere._jit import constant
 from haltere.filter.windows import windows
 
-__all__ = ["LATELY", "MARKS", "PAIR_WINDOW", "pairs"]
+__all__ = ["LATELY", "MARKS", "MATCHED", "PAIR_WINDOW", "pairs"]
 
 #: Longest window of the detectors in blocks of a hundredth of a second, in a plain number: it is a modulus.
 PAIR_WINDOW = constant(512)
 #: Blocks whose residuals of rate are kept.
 LATELY = constant(64)
+#: Blocks for which a step of a rate is looked for: a chain has followed it by then. In a plain number: it is a modulus.
+MATCHED = constant(24)
 #: Quarters of a second that the past of each pair is kept.
 MARKS = constant(40)
 
@@ -82,6 +84,11 @@ def pairs() -> np.dtype[np.void]:
                 ("r", "f8", 6),
                 ("before", "f8", 6),
                 ("w", windows(int(PAIR_WINDOW)), (6,)),
+                # of rates, a step at each of the last blocks: what it would be in the next innovation, sums of products and squares
+                ("expected", "f8", (3, int(MATCHED))),
+                ("agrees", "f8", (3, int(MATCHED))),
+                ("energy", "f8", (3, int(MATCHED))),
+                ("n_matched", "i8", 3),
                 # statistic over threshold: largest of this stretch and of the one before, what is usual
                 ("peak", "f8", 6),
                 ("waiting", "f8", 6),
@@ -97,7 +104,8 @@ def pairs() -> np.dtype[np.void]:
                 ("mark", "i8"),
                 ("mean_T", "f8"),  # mean residual along the thrust axis since then, and of how many blocks
                 ("mean_n", "f8"),
-                ("t_hint", "f8", 6),  # last alarm of each pair, whatever came of it
+                ("t_hint", "f8", 6),  # last alarm of each pair, whatever came of it, and its sign
+                ("hint_sign", "f8", 6),
                 ("t_across", "f8"),  # last verdict on forces was pending
                 ("t_deaf", "f8"),  # until when forces are not listened to
                 ("t_step", "f8", 3),  # onset of the last step of a gyro axis that the rotors do not explain, and its size [rad/s]
