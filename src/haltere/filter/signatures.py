@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 
 from haltere._jit import constant, jit
-from haltere.filter import turning
+from haltere.filter import rising, turning
 from haltere.filter.update import Row
 
 __all__ = [
@@ -58,8 +58,8 @@ ZERO, ONE = np.float32(0.0), np.float32(1.0)
 #: A whitened innovation counts up to so many sigma, more by this factor of the one before it: a lone outlier proves nothing. Beyond, its
 #: variance is inflated instead of the innovation cut: cut ones would look like something that grows.
 ALONE, FOLLOWED = 4.0, 1.2
-#: Components of an innovation that have a signature of their own: six of GNSS, and the heading (see haltere.aids.record).
-N_GNSS, C_HEADING = 6, 7
+#: Components of an innovation that have a signature of their own: six of GNSS, and the heading; and the altitude (see haltere.aids.record).
+N_GNSS, C_ALTITUDE, C_HEADING = 6, 6, 7
 #: Memory of the usual square of a component's innovation [s], from how many on it is known, and how far a lone one may move it.
 OWN, KNOWN, LONE_SQUARE = 40.0, 20.0, 9.0
 
@@ -224,6 +224,8 @@ def matched(s: Any, H: Row, S: float, y: float, component: int, evidence: bool, 
         z = weight * y
         b.fresh = 1
         add_square(b, s.t, component, z * y)
+        if component == C_ALTITUDE:
+            rising.hear(b, s.t, y - s.p[2] + (s.baro[0] if len(s.baro) > 0 else s.baro_start))
     if heading:
         b.t_heading = s.t
     z4, weight4 = np.float32(z), np.float32(weight)

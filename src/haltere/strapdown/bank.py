@@ -7,7 +7,9 @@ from functools import cache
 import numpy as np
 
 from haltere._jit import constant
+from haltere.filter.rising import RISE_RING
 from haltere.filter.signatures import BANK_COLUMNS, SLOTS
+from haltere.filter.windows import windows
 
 __all__ = ["STEPS", "STEP_HISTORY", "STEP_RING", "bank"]
 
@@ -80,6 +82,38 @@ _TRACK = _record(
     ("about", "f8"),
 )
 
+#: What `haltere.filter.rising` knows of the barometer, and `haltere.diagnosis.height` makes of it.
+_HEIGHT = _record(
+    ("climb", "f8"),  # integral of the vertical velocity, up [m]
+    ("total", "f8"),  # samples of the value to come, the time of the last one, number of values since it began
+    ("n", "f8"),
+    ("t_value", "f8"),
+    ("n_values", "i8"),
+    ("before", "f8"),
+    ("level", "f8"),  # and its variance, noise of a value, factor on the walk
+    ("P", "f8"),
+    ("r", "f8"),
+    ("scale", "f8"),
+    ("z", "f8"),  # innovation, its mean square, product of neighbours, from how many
+    ("c0", "f8"),
+    ("c1", "f8"),
+    ("known", "f8"),
+    ("w", windows(int(RISE_RING))),
+    ("glr", "f8"),
+    ("fresh", "i8"),
+    ("d", "f8", int(RISE_RING)),  # the last values, and their times
+    ("t", "f8", int(RISE_RING)),
+    ("filled", "i8"),
+    ("peak", "f8"),  # statistic over threshold: largest of this stretch and of the one before, what is usual
+    ("waiting", "f8"),
+    ("usual", "f8"),
+    ("t_usual", "f8"),
+    ("t_alarm", "f8"),  # of what is looked into (0: nothing): when it alarmed, 1 a step, -1 none, its size and onset
+    ("verdict", "i8"),
+    ("size", "f8"),
+    ("onset", "f8"),
+)
+
 #: Part of Φ since the last fusion, see `haltere.filter.signatures.move`.
 _TRANSITION = _record(("P", "f8", (15, 15)))
 
@@ -148,4 +182,5 @@ def bank(n: int) -> np.dtype[np.void]:
         ("turn_lasted", "f8"),
         ("turn", "f8"),
         ("step", STEPS),
+        ("height", _HEIGHT),
     )
