@@ -10,7 +10,9 @@ import pytest
 from numpy.typing import NDArray
 
 from haltere._jit import COMPILED
+from haltere.diagnosis import inertial
 from haltere.filter import signatures, turning
+from haltere.filter.update import NONE
 from haltere.strapdown.layout import layout
 
 DEG = math.pi / 180.0
@@ -30,7 +32,7 @@ def bank() -> Any:
 
 def wait(b: Any, w: tuple[float, float, float] = NO_TURN, dt: float = DT, calibration: float = 0.0) -> None:
     for _ in range(4):
-        turning.suppose(b, GYRO, 0.0, DRIFT, calibration, w, UP, dt / 4)
+        turning.suppose(b, GYRO, 0.0, DRIFT, calibration, w, UP, dt / 4, NO_TURN, 0.0)
 
 
 def test_it_is_a_kalman_filter_on_innovations_and_on_every_response() -> None:
@@ -45,7 +47,7 @@ def test_it_is_a_kalman_filter_on_innovations_and_on_every_response() -> None:
         y = 0.02 * rng.standard_normal()
         wait(b)
         t += DT
-        b["e"][columns] = e
+        b["bearing"][columns] = e
         turning.hear(b, t, y)
         if i == 0:
             state[0], P = np.r_[y, e], np.diag([r, turning.DRIFT**2])
@@ -104,7 +106,7 @@ def test_a_drift_of_the_gyro_has_its_size_and_none_is_none() -> None:
         for i in range(n):
             if i == start:
                 b["num"][7] = b["den"][7] = b["heading_o"][7] = b["heading_d"][7] = 0.0
-            b["e"][7] = 0.5 * late[i] ** 2
+            b["bearing"][7] = 0.5 * late[i] ** 2
             wait(b)
             turning.hear(b, (i + 1) * DT, float(y[i]))
         num, den = float(b["num"][7]), float(b["den"][7])
@@ -124,7 +126,7 @@ def test_a_compass_that_may_turn_with_the_vehicle_says_little_while_it_turns() -
         b[i]["track"]["r"], b[i]["track"]["known"] = (2.0 * DEG) ** 2, 1e9
         for k in range(200):
             wait(b[i], (0.0, 0.0, 1.0), calibration=calibration)
-            b[i]["e"][7] = 0.01 * k
+            b[i]["bearing"][7] = 0.01 * k
             turning.hear(b[i], (k + 1) * DT, 0.0)
     assert float(b[1]["den"][7]) < 0.2 * float(b[0]["den"][7])
 
@@ -135,6 +137,33 @@ def test_a_gap_begins_anew_and_says_nothing() -> None:
         wait(b)
         turning.hear(b, (k + 1) * DT, 0.0)
     before = float(b["den"][7])
-    b["e"][7] = 1.0
+    b["bearing"][7] = 1.0
     assert turning.hear(b, 100 * DT + 2.0, 1.0) < 0.0
     assert float(b["den"][7]) == before
+
+
+def test_no_correction_is_in_what_a_gyro_axis_turns_by_itself() -> None:
+    """A unit rate of gyro z since a slot was opened turns the gyro's heading by its time, whatever gains took out of the filter's."""
+    rng = np.random.default_rng(5)
+    S = np.zeros(1, layout(1, banks=1))
+    S = S if COMPILED else S.view(np.recarray)
+    s = S[0]
+    s["q"][0] = 1.0
+    b = s["bank"][0]
+    signatures.clear(b)
+    z, ramp, compass = (int(f) * int(signatures.SLOTS) + 4 for f in (2, 8, signatures.HEADING))
+    eye = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
+    nothing = ((0.0, 0.0, 0.0),) * 3
+    for k in range(150):
+        s["t"] += DT
+        if k == 50:
+            signatures.open_slot(s, 4, UP)
+        inertial.carry(s, eye, nothing, nothing, DT)
+        turning.suppose(b, GYRO, 0.0, DRIFT, 0.0, NO_TURN, UP, DT, NO_TURN, 0.0)
+        s["k"][:] = 0.05 * rng.standard_normal(len(s["k"]))
+        signatures.matched(s, ((0, UP), NONE, NONE), 1.0, 0.0, 7, True, True)
+    lasted = 100 * DT
+    assert b["bearing"][z] == pytest.approx(-lasted, rel=1e-4)
+    assert b["bearing"][ramp] == pytest.approx(-0.5 * lasted**2, rel=0.02)
+    assert b["bearing"][compass] == pytest.approx(1.0, abs=1e-5)
+    assert abs(b["e"][z] + lasted) > 0.2  # the filter's own innovation is what the gains have made of it

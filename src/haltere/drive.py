@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from haltere._jit import as_records
-from haltere.aids.compass import OUT_APART, OUT_FIELD, OUT_TURN
+from haltere.aids.compass import OUT_APART, OUT_FIELD, OUT_STEP, OUT_TURN
 from haltere.aids.record import AID_RECORD, COMPONENTS, EVENTS, N_QUEUED, REASONS, SENSORS, STATUSES, YAW_BANK
 from haltere.diagnosis.findings import findings
 from haltere.errors import HaltereError, UsageError
@@ -46,7 +46,7 @@ FloatArray = NDArray[np.float64]
 #: IMU samples between two looks at progress, and room for aid records between two drains.
 CHUNK, AID_ROOM = 20000, 60000
 #: What a disturbed compass may be instead: a compass that turns against the gyro is as well a gyro that turns against the compass.
-CANDIDATES = {OUT_TURN: ["magnetometer", "gyro.z"], OUT_FIELD: ["magnetometer"], OUT_APART: ["magnetometer"]}
+CANDIDATES = {OUT_TURN: ["magnetometer", "gyro.z"], OUT_FIELD: ["magnetometer"], OUT_APART: ["magnetometer"], OUT_STEP: ["magnetometer"]}
 
 
 def run(
@@ -339,6 +339,7 @@ def _event(kind: str, sensor: str, record: np.void, bank: bool) -> dict[str, Any
         "disturb": {
             OUT_TURN: f"the compass turned by {turned} against the gyro; {allowed} are allowed",
             OUT_FIELD: "strength or dip of the field are not those of before, or not the Earth's",
+            OUT_STEP: f"the compass steps by {turned} at once and stays there, which the gyro does not; {allowed} are allowed",
             OUT_APART: f"the compass is {turned} off the heading that everything else holds; {allowed} are allowed",
         }.get(detail, ""),
         "recovered": f"agrees again, {value:.1f} s after the onset",
@@ -347,7 +348,8 @@ def _event(kind: str, sensor: str, record: np.void, bank: bool) -> dict[str, Any
         "diverged": "state or covariance not finite or not positive",
     }.get(kind, kind)
     return {
-        "sensor": sensor, "axis": None, "kind": kind, "t_onset": float(record["onset"]), "t_detected": t, "t_isolated": None,
+        "sensor": sensor, "axis": None, "kind": kind, "t_onset": float(record["onset"]), "t_detected": float(record["seen"]),
+        "t_isolated": t if kind == "disturb" and detail == OUT_STEP else None,
         "t_recovered": None, "candidates": CANDIDATES.get(detail, []) if kind == "disturb" else [], "statistic": value,
         "threshold": threshold if math.isfinite(threshold) else None, "evidence": evidence,
     }  # fmt: skip

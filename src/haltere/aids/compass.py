@@ -32,12 +32,16 @@ from haltere.strapdown.layout import COMPASS_BINS
 __all__ = [
     "OUT_APART",
     "OUT_FIELD",
+    "OUT_STEP",
     "OUT_TURN",
+    "allowed",
     "along",
     "attribute",
     "forget",
     "level",
+    "moment",
     "observe",
+    "put_out",
     "tilt_variance",
     "unsee",
     "vertical_bias",
@@ -61,7 +65,7 @@ BEYOND = 0.5 * math.pi
 #: What is then taken to be wrong, 1 sigma: yaw [rad] and vertical gyro bias [rad/s].
 YAW_SPOILT, BIAS_SPOILT = math.radians(60.0), 0.1
 #: What put the compass out.
-OUT_TURN, OUT_FIELD, OUT_APART = (constant(i) for i in (1, 2, 3))
+OUT_TURN, OUT_FIELD, OUT_APART, OUT_STEP = (constant(i) for i in (1, 2, 3, 4))
 
 
 @jit
@@ -69,7 +73,7 @@ def forget(s: Any) -> None:
     """Start the history anew: at the beginning, after a gap, when the compass comes back."""
     c = s.compass
     c.out, c.n, c.filled, c.head, c.seen = 0, 0, 0, 0, 0
-    c.bad, c.total, c.slow = 0.0, 0.0, 0.0
+    c.bad, c.total, c.slow, c.pending = 0.0, 0.0, 0.0, 0
 
 
 @jit
@@ -178,6 +182,18 @@ def take_back(s: Any, prm: Any, k: int) -> None:
 
 
 @jit
+def moment(s: Any, t: float) -> tuple[int, float]:
+    """How many bins ago time t was, the last bin before it, and the largest rate about then [rad/s]."""
+    c = s.compass
+    k, rate = 0, 0.0
+    while k < c.filled - 1 and c.bin[back(c, k)].t >= t:
+        k += 1
+    for i in range(max(k - 1, 0), min(k + 2, c.filled)):
+        rate = max(rate, c.bin[back(c, i)].rate)
+    return k, rate
+
+
+@jit
 def put_out(s: Any, prm: Any, k: int, cause: Any, value: float, threshold: float) -> None:
     """The compass is disturbed since the bin k bins ago: take back what it did, and hear it no more."""
     c = s.compass
@@ -268,6 +284,8 @@ def close_bin(s: Any, prm: Any) -> None:
     c.n, c.total = 0, 0.0
     if c.out == 0:
         difference, bound, begin = compare(s, prm)
+        if c.pending == 1:
+            return  # diagnosis is about to say whether it stepped
         if len(s.bank) > 0 and s.bank[0].ratio > 0.35:
             return  # diagnosis is about to find what is wrong: a tilt turns the levelled heading, too
         if abs(difference) > bound:

@@ -16,11 +16,11 @@ from haltere.aids import compass
 from haltere.aids.fusing import DISTRUSTED, RUNNING
 from haltere.aids.record import E_FAULT, E_SUSPECT, GNSS_POSITION, GNSS_VELOCITY, NO_SENSOR, event_since
 from haltere.core.rotation import Mat, dcm
-from haltere.diagnosis import doubt, pairs, steps
+from haltere.diagnosis import doubt, jumps, pairs, steps
 from haltere.diagnosis.heading import gyro_that_turns
 from haltere.diagnosis.healing import follow, heal, heal_between
 from haltere.diagnosis.steps import refuted, shown
-from haltere.filter import turning
+from haltere.filter import jumping, turning
 from haltere.filter.signatures import (
     ACCEL,
     ACCEL_RAMP,
@@ -99,6 +99,7 @@ def carry(s: Any, D: Mat, A: Mat, B: Mat, dt: float) -> None:
         b.phi.P[9 + a, 9 + a] += dt
         b.phi.P[12 + a, 12 + a] += dt
     b.span += dt
+    b.climb -= s.v[2] * dt
 
 
 @jit
@@ -191,13 +192,21 @@ def tick(s: Any, prm: Any, dt: float) -> bool:
     b = s.bank[0]
     follow(s, dt)
     doubt.note(s, dt)
+    jumps.listen(b.height, s.t, prm.diagnosis_threshold, jumps.LASTS)
+    if sick(s):
+        jumping.restart(b.course)
+    else:
+        jumps.compass_that_steps(s, prm)
     calibration = prm.robust_calibration / max(math.cos(s.field[1]), 0.1)
     w, down = (s.w[0], s.w[1], s.w[2]), dcm((s.q[0], s.q[1], s.q[2], s.q[3]))[2]
-    turning.suppose(b, prm.noise_gyro, prm.noise_gyro_scale, prm.noise_gyro_bias, calibration, w, down, dt)
+    bias, unsure = (s.bg[0], s.bg[1], s.bg[2]), compass.along(s.P, down, 9) if b.track.n == 0 else 0.0
+    turning.suppose(b, prm.noise_gyro, prm.noise_gyro_scale, prm.noise_gyro_bias, calibration, w, down, dt, bias, unsure)
     if b.n_aligned != s.n_aligned or abs(s.yaw_corrected - b.yaw) > 0.5:
         clear(b)
         if b.n_aligned != s.n_aligned:
             steps.forget(b)
+            jumping.restart(b.height)
+            jumping.restart(b.course)
             doubt.begin(s)
             b.t_block = s.t + BLOCK
             for g in range(N_FAMILIES):
@@ -209,6 +218,8 @@ def tick(s: Any, prm: Any, dt: float) -> bool:
     if b.n_gaps != s.n_gaps:  # what happened meanwhile is in no response
         b.n_gaps = s.n_gaps
         clear(b)
+        jumping.restart(b.height)
+        jumping.restart(b.course)
         b.t_doubt = max(b.t_doubt, s.t + doubt.AFTER_GAP)
     if s.t >= b.t_slot:
         b.t_slot = s.t + GRID - 1e-6
@@ -267,10 +278,13 @@ def weigh(s: Any, prm: Any) -> tuple[int, float]:
         tolerance, largest, least = free(s, prm, f), most(f), 0.25 * prm.diagnosis_threshold
         if sure and f >= VELOCITY:
             tolerance *= VOUCHED
-        h = prm.diagnosis_threshold * (1.0 if g < F_VELOCITY else OTHERS)
+        usually = tolerance
         for k in range(SLOTS):
             j = f * SLOTS + k
             den = b.den[j]
+            tolerance, h = usually, prm.diagnosis_threshold * (1.0 if g < F_VELOCITY else OTHERS)
+            if f == BAROMETER_OFFSET and jumps.settled(b.height, b.onset[k]):  # the flight's own barometer says that it is no gust
+                tolerance, h = min(tolerance, LATE * b.sank), prm.diagnosis_threshold
             num = abs(b.num[j])
             if num * num > least * den and den > LEAST:
                 span = GRID + 0.2 * (s.t - b.onset[k])
@@ -347,6 +361,8 @@ def judge(s: Any, prm: Any) -> bool:
     if b.alarm == 0:
         b.alarm, b.t_seen = 1, s.t
     k = b.slot[lead]
+    if lead == F_BAROMETER and jumps.stepped(b.height, b.onset[k]):
+        b.t_seen = min(b.t_seen, b.height.t_alarm)
     if lead >= F_VELOCITY and lead < F_COMPASS and not doubt.vouched(s):
         return False
     if not doubt.may_name(b, lead, s.t) or not doubt.judged(s) or not doubt.fits(s, b.fault[lead] * SLOTS + k, k):
@@ -388,6 +404,8 @@ def tell(s: Any, prm: Any, code: Any, g: int, candidates: int) -> None:
         hint = pairs.hinted(s, g, b.onset[k], b.num[j]) if g < F_VELOCITY else -1.0  # the vehicle's model said so before
         if hint >= 0.0:
             e.seen = min(e.seen, hint)
+        if g == F_BAROMETER and jumps.stepped(b.height, b.onset[k]):
+            e.onset, e.seen = b.height.onset, b.height.t_alarm
         e.left = doubt.left(b, j, k) / max(b.num[j] * b.num[j] / b.den[j], 1e-9)
 
 

@@ -17,7 +17,8 @@ from typing import Any
 import numpy as np
 
 from haltere._jit import constant, jit
-from haltere.filter import turning
+from haltere.core.rotation import dcm
+from haltere.filter import jumping, turning
 from haltere.filter.update import Row
 
 __all__ = [
@@ -58,10 +59,12 @@ ZERO, ONE = np.float32(0.0), np.float32(1.0)
 #: A whitened innovation counts up to so many sigma, more by this factor of the one before it: a lone outlier proves nothing. Beyond, its
 #: variance is inflated instead of the innovation cut: cut ones would look like something that grows.
 ALONE, FOLLOWED = 4.0, 1.2
-#: Components of an innovation that have a signature of their own: six of GNSS, and the heading (see haltere.aids.record).
-N_GNSS, C_HEADING = 6, 7
+#: Components of an innovation that have a signature of their own: six of GNSS, and the heading; and the altitude (see haltere.aids.record).
+N_GNSS, C_ALTITUDE, C_HEADING = 6, 6, 7
 #: Memory of the usual square of a component's innovation [s], from how many on it is known, and how far a lone one may move it.
 OWN, KNOWN, LONE_SQUARE = 40.0, 20.0, 9.0
+#: 1 sigma of a barometer [m] and of a compass [rad] before anything is known of them, see `haltere.filter.jumping`.
+METRE, RADIAN = 1.0, 0.1
 
 
 @jit
@@ -115,6 +118,7 @@ def open_slot(s: Any, k: int, down: Vec) -> None:
         for i in range(x.shape[0]):
             x[i, j] = 0.0
     b.excess[k], b.spread[k] = 0.0, 0.0
+    turning.open_slot(b, k)
     for a in range(3):
         x[9 + a, (GYRO + a) * SLOTS + k] = 1.0
         x[12 + a, (ACCEL + a) * SLOTS + k] = 1.0
@@ -212,7 +216,8 @@ def matched(s: Any, H: Row, S: float, y: float, component: int, evidence: bool, 
     b = s.bank[0]
     if b.span > 0.0:
         move(b)
-    x, e, num, den = b.x, b.e, b.num, b.den
+    x, e, bearing, num, den = b.x, b.e, b.bearing, b.num, b.den
+    down = dcm((s.q[0], s.q[1], s.q[2], s.q[3]))[2]
     z, weight = 0.0, 0.0
     heading = evidence and component == C_HEADING
     if evidence and not heading:
@@ -224,6 +229,8 @@ def matched(s: Any, H: Row, S: float, y: float, component: int, evidence: bool, 
         z = weight * y
         b.fresh = 1
         add_square(b, s.t, component, z * y)
+        if component == C_ALTITUDE:
+            jumping.hear(b.height, s.t, y - s.p[2] + (s.baro[0] if len(s.baro) > 0 else s.baro_start) - b.climb, METRE)
     if heading:
         b.t_heading = s.t
     z4, weight4 = np.float32(z), np.float32(weight)
@@ -247,6 +254,10 @@ def matched(s: Any, H: Row, S: float, y: float, component: int, evidence: bool, 
             for j in range(c, c + WIDTH):
                 num[j] += z4 * e[j]
                 den[j] += weight4 * e[j] * e[j]
+        if heading:  # less its turn of the filter's own heading
+            d0, d1, d2 = single(down[0], down[1], down[2])
+            for j in range(c, c + WIDTH):
+                bearing[j] = e[j] - (d0 * x[0, j] + d1 * x[1, j] + d2 * x[2, j])
         if moved:
             for i in range(x.shape[0]):
                 k = np.float32(s.k[i])
@@ -254,7 +265,9 @@ def matched(s: Any, H: Row, S: float, y: float, component: int, evidence: bool, 
                     for j in range(c, c + WIDTH):
                         x[i, j] -= k * e[j]
     if heading:
-        square = turning.hear(b, s.t, y)
+        jumping.hear(b.course, s.t, y + s.yaw_corrected, RADIAN)
+        turning.by_itself(b, s.t, GYRO, GYRO_RAMP)
+        square = turning.hear(b, s.t, y + s.yaw_corrected - b.track.by_bias)
         if square >= 0.0:
             b.fresh = 1
             add_square(b, s.t, component, square)

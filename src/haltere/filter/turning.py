@@ -1,11 +1,14 @@
-"""Heading innovations as evidence: whitened by what a compass is in this flight, not by what a filter believes of it. It decides nothing.
+"""Heading as evidence: compass against gyro, whitened by what the compass is in this flight. It decides nothing.
 
-A filter takes a compass for little: what surroundings and calibration add lasts, so that many samples are worth one. Its heading then
-runs by itself, and the innovations of heading are white noise of the compass upon an error that hardly changes. What changes is evidence.
-So the innovations y pass a filter of two states, offset and drift, y = o + n, do = r dt + w, dr = w', and so does every response of the
+A filter takes a compass for little: what surroundings and calibration add lasts, so that many samples are worth one. Its heading then is
+what GNSS velocity makes of it and wanders by degrees, which is no news of any sensor. So the corrections that were made are taken off
+again, of yaw and what those of the bias have turned since: what is left is heading by compass less heading by the gyro alone, white noise
+of the compass upon an error that hardly changes. What changes is evidence.
+So these y pass a filter of two states, offset and drift, y = o + n, do = r dt + w, dr = w', and so does every response of the
 bank, since all is linear: what comes out is white (theory.md §5.7, theory-amendments.md §3). The variance of n is measured between
 neighbours; w is the gyro's noise and scale, and what surroundings and, when the vehicle turns, calibration do to the compass: as much of
-that as this flight shows, so that means over a second of what comes out are as white as its samples.
+that as this flight shows, so that means over a second of what comes out are as white as its samples. The response of y to a fault is what
+the tilt that it has put into the filter does to a levelled heading, and the turn that a gyro axis makes by itself: no correction is in it.
 """
 
 from __future__ import annotations
@@ -18,7 +21,7 @@ import numpy as np
 from haltere._jit import constant, jit
 from haltere.core.rotation import Vec
 
-__all__ = ["hear", "restart", "suppose"]
+__all__ = ["by_itself", "hear", "open_slot", "restart", "suppose"]
 
 #: Memory of the white variance [s], from how many samples on it is known, its least [rad^2], and how far a lone one may move it.
 MEMORY, KNOWN, LEAST, LONE = 20.0, 25.0, math.radians(0.3) ** 2, 9.0
@@ -46,7 +49,9 @@ def restart(b: Any) -> None:
 
 
 @jit
-def suppose(b: Any, gyro: float, scale: float, drift: float, calibration: float, w: Vec, down: Vec, dt: float) -> None:
+def suppose(
+    b: Any, gyro: float, scale: float, drift: float, calibration: float, w: Vec, down: Vec, dt: float, bias: Vec, unsure: float
+) -> None:
     """Add to what heading and compass may have done by themselves since the last sample.
 
     What is off by a part of how far the vehicle has turned varies by that part squared, times the square of the turn: with a rate that is
@@ -63,8 +68,17 @@ def suppose(b: Any, gyro: float, scale: float, drift: float, calibration: float,
         Angular rate [rad/s] and the vertical, both in the body frame.
     dt
         Time [s].
+    bias, unsure
+        Bias of the gyro in use [rad/s], and the variance of what it turns about the vertical [rad^2/s^2].
     """
     k = b.track
+    for i in range(3):
+        if k.n == 0:
+            k.bias[i] = bias[i]
+        k.spun[i] += down[i] * dt
+        k.by_bias += down[i] * (bias[i] - k.bias[i]) * dt
+    if k.n == 0:
+        k.unsure = unsure
     part = min(1.0, dt / TOGETHER)
     about = w[0] * down[0] + w[1] * down[1] + w[2] * down[2]
     k.about += part * (about - k.about)
@@ -79,16 +93,41 @@ def suppose(b: Any, gyro: float, scale: float, drift: float, calibration: float,
 
 
 @jit
+def open_slot(b: Any, k: int) -> None:
+    """Let a slot's gyro axes begin to turn now."""
+    for a in range(3):
+        b.track.turned[k, a], b.track.ramped[k, a] = -b.track.spun[a], 0.0
+
+
+@jit
+def by_itself(b: Any, t: float, gyro: int, ramp: int) -> None:
+    """Add to ``b.bearing`` what gyro axes turn by themselves: steps are the signatures from ``gyro`` on, ramps those from ``ramp`` on."""
+    k = b.track
+    slots = len(b.live)
+    for i in range(slots):
+        if b.live[i] == 1:
+            middle = t - 0.5 * (t - k.t_spun) - b.onset[i]
+            for a in range(3):
+                k.turned[i, a] += k.spun[a]
+                k.ramped[i, a] += k.spun[a] * max(middle, 0.0)
+                b.bearing[(gyro + a) * slots + i] -= np.float32(k.turned[i, a])
+                b.bearing[(ramp + a) * slots + i] -= np.float32(k.ramped[i, a])
+    for a in range(3):
+        k.spun[a] = 0.0
+    k.t_spun = t
+
+
+@jit
 def begin(b: Any, t: float, y: float) -> None:
     """Take the first sample for the offset."""
     k = b.track
     if k.r == 0.0:
         k.r, k.share = UNKNOWN, 1.0
     k.t, k.o, k.d, k.y, k.n = t, y, 0.0, y, 1
-    k.oo, k.od, k.dd, k.last, k.q, k.q_drift = k.r, 0.0, DRIFT * DRIFT, 0.0, 0.0, 0.0
+    k.oo, k.od, k.dd, k.last, k.q, k.q_drift = k.r, 0.0, max(DRIFT * DRIFT, k.unsure), 0.0, 0.0, 0.0
     k.total, k.samples, k.t_block = 0.0, 0.0, t
     for j in range(len(b.heading_o)):
-        b.heading_o[j], b.heading_d[j] = b.e[j], 0.0
+        b.heading_o[j], b.heading_d[j] = b.bearing[j], 0.0
 
 
 @jit
@@ -117,7 +156,7 @@ def adapt(k: Any, t: float, z: float) -> None:
 
 @jit
 def hear(b: Any, t: float, y: float) -> float:
-    """Take an innovation of heading ``y`` [rad], whose responses are in ``b.e``, as evidence.
+    """Take heading by compass less that by the gyro alone, ``y`` [rad], whose responses are in ``b.bearing``, as evidence.
 
     Returns
     -------
@@ -148,7 +187,7 @@ def hear(b: Any, t: float, y: float) -> float:
     k.n += 1
     adapt(k, t, share * z)
     weight = 0.0 if k.known < KNOWN else share * share / S
-    o, d, e, num, den = b.heading_o, b.heading_d, b.e, b.heading_num, b.heading_den
+    o, d, e, num, den = b.heading_o, b.heading_d, b.bearing, b.heading_num, b.heading_den
     total_num, total_den = b.num, b.den
     step, go, gd = np.float32(dt), np.float32(share * g_o), np.float32(share * g_d)
     w4, z4 = np.float32(weight), np.float32(weight * left)

@@ -7,7 +7,9 @@ from functools import cache
 import numpy as np
 
 from haltere._jit import constant
+from haltere.filter.jumping import JUMP_RING
 from haltere.filter.signatures import BANK_COLUMNS, SLOTS
+from haltere.filter.windows import windows
 
 __all__ = ["STEPS", "STEP_HISTORY", "STEP_RING", "bank"]
 
@@ -78,6 +80,46 @@ _TRACK = _record(
     ("share", "f8"),  # of what a compass may turn by itself, as this flight shows
     ("w", "f8", 3),  # rate of late across the vertical, and about it
     ("about", "f8"),
+    ("bias", "f8", 3),  # of the gyro when it began, variance of what that turns, and turn by what it has changed since
+    ("unsure", "f8"),
+    ("by_bias", "f8"),
+    ("spun", "f8", 3),  # turn by a unit rate of each axis since the last sample, and by slot in all, for a step and for a ramp
+    ("t_spun", "f8"),
+    ("turned", "f8", (int(SLOTS), 3)),
+    ("ramped", "f8", (int(SLOTS), 3)),
+)
+
+#: What `haltere.filter.jumping` knows of barometer or compass, and `haltere.diagnosis.jumps` makes of it.
+_JUMP = _record(
+    ("total", "f8"),  # samples of the value to come, the time of the last one, number of values since it began
+    ("n", "f8"),
+    ("t_value", "f8"),
+    ("n_values", "i8"),
+    ("before", "f8"),
+    ("level", "f8"),  # and its variance, noise of a value, factor on the walk
+    ("P", "f8"),
+    ("r", "f8"),
+    ("scale", "f8"),
+    ("q", "f8"),  # variance of that walk, a second
+    ("z", "f8"),  # innovation, its mean square, product of neighbours, from how many
+    ("c0", "f8"),
+    ("c1", "f8"),
+    ("known", "f8"),
+    ("w", windows(int(JUMP_RING))),
+    ("glr", "f8"),
+    ("fresh", "i8"),
+    ("d", "f8", int(JUMP_RING)),  # the last values, and their times
+    ("t", "f8", int(JUMP_RING)),
+    ("filled", "i8"),
+    ("peak", "f8"),  # statistic over threshold: largest of this stretch and of the one before, what is usual
+    ("waiting", "f8"),
+    ("usual", "f8"),
+    ("t_usual", "f8"),
+    ("t_alarm", "f8"),  # of what is looked into (0: nothing): when it alarmed, 1 a step, -1 none, its size and onset
+    ("verdict", "i8"),
+    ("size", "f8"),
+    ("onset", "f8"),
+    ("t_free", "f8"),  # nothing alarms before
 )
 
 #: Part of Φ since the last fusion, see `haltere.filter.signatures.move`.
@@ -90,6 +132,7 @@ def bank(n: int) -> np.dtype[np.void]:
     return _record(
         ("x", "f4", (n, BANK_COLUMNS)),
         ("e", "f4", BANK_COLUMNS),
+        ("bearing", "f4", BANK_COLUMNS),  # responses of heading by compass less that by the gyro
         ("num", "f4", BANK_COLUMNS),
         ("den", "f4", BANK_COLUMNS),
         ("heading_o", "f4", BANK_COLUMNS),  # responses through `haltere.filter.turning`, and what heading alone says of each
@@ -148,4 +191,8 @@ def bank(n: int) -> np.dtype[np.void]:
         ("turn_lasted", "f8"),
         ("turn", "f8"),
         ("step", STEPS),
+        ("climb", "f8"),  # integral of the vertical velocity, up [m]
+        ("height", _JUMP),
+        ("course", _JUMP),
+        ("course_healed", "i8"),
     )

@@ -182,6 +182,7 @@ COMPASS = _record(
     ("path", "f8"),
     ("path_before", "f8"),
     ("t_close", "f8"),
+    ("pending", "i8"),  # diagnosis looks into a step of it
     ("jump", "f8"),  # what put it out [rad], and the 1 sigma of yaw then
     ("yaw_sd", "f8"),
     ("head", "i8"),
