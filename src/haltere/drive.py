@@ -315,7 +315,7 @@ def _drain(S: NDArray[np.void], aids: NDArray[np.void], parts: list[NDArray[np.v
         S["n_aids"] = 0
     for e in S["event"][0, : int(S["n_events"][0])]:
         kind = EVENTS[int(e["code"])]
-        if kind in ("fault", "suspect", "over"):
+        if kind in ("fault", "suspect", "over", "alarm"):
             findings(kind, e, events)
             continue
         if kind in VERDICTS:

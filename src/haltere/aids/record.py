@@ -51,15 +51,15 @@ R_NONE, R_INNOVATION, R_TIMEOUT, R_START, R_STRENGTH, R_DIP, R_HORIZONTAL, R_ALI
 R_ACCELERATION = constant(10)
 
 #: "fault", "suspect" and "over" are findings of `haltere.diagnosis`: a fault that is named, one of several, and the end of one; the last
-#: three are verdicts of `fault-tolerant`: named and left out, one of several, heard again.
+#: three but one are verdicts of `fault-tolerant`: named and left out, one of several, heard again; "alarm" is one of J21 to J24.
 EVENTS = (
     "aligned", "reset", "diverged", "realigned", "gap", "recovered", "timeout", "disturb", "fault", "suspect", "over",
-    "isolated", "undecided", "readmitted",
+    "isolated", "undecided", "readmitted", "alarm",
 )  # fmt: skip
 E_ALIGNED, E_RESET, E_DIVERGED, E_REALIGNED, E_GAP, E_RECOVERED, E_TIMEOUT, E_DISTURBED, E_FAULT, E_SUSPECT, E_OVER = (
     constant(i) for i in range(11)
 )
-E_ISOLATED, E_UNDECIDED, E_READMITTED = (constant(i) for i in range(11, 14))
+E_ISOLATED, E_UNDECIDED, E_READMITTED, E_ALARM = (constant(i) for i in range(11, 15))
 
 AID_RECORD = np.dtype(
     [
@@ -126,7 +126,7 @@ def event_since(s: Any, t: float, onset: float, code: int, sensor: int, value: f
         e = s.event[i]
         e.t, e.onset, e.code, e.sensor, e.value, e.threshold, e.detail = t, onset, code, sensor, value, threshold, detail
         e.seen, e.size, e.sd, e.candidates, e.left = t, math.nan, math.nan, 0, math.nan
-        for k in range(6):
+        for k in range(len(e.alarms)):
             e.alarms[k] = math.nan
         s.n_events = i + 1
     else:

@@ -9,7 +9,7 @@ import numpy as np
 
 from haltere.diagnosis.inertial import FAMILIES
 from haltere.diagnosis.model_faults import MODEL
-from haltere.diagnosis.model_findings import of_the_model
+from haltere.diagnosis.model_findings import detectors, of_the_model
 from haltere.diagnosis.steps import DEATHS, STEP
 
 __all__ = ["findings"]
@@ -52,6 +52,8 @@ def findings(kind: str, record: np.void, events: list[dict[str, Any]]) -> None:
     what = {6: "velocity ", 7: "velocity ", 8: "velocity ", 9: "position ", 10: "position ", 11: "position "}.get(family, "")
     evidence = f"{what}{size:+.3g} ± {sd:.2g} {unit} explains the innovations since {float(record['onset']):.2f} s"
     evidence += f" and leaves {max(float(record['left']), 0.0):.0%} as much unexplained"
+    for said, how in zip(detectors(record, 6), ("", " silent"), strict=True):
+        evidence += f"; {said}{how}" if said else ""
     isolated = kind == "fault"
     if isolated:
         done = "its effect was taken back" if sensor in ("gyro", "accel", "barometer") else "its effect was taken back; it is not heard"

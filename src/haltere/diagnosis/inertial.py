@@ -19,6 +19,7 @@ from haltere.core.rotation import Mat, dcm
 from haltere.diagnosis import doubt, jumps, pairs, steps
 from haltere.diagnosis.heading import gyro_that_turns
 from haltere.diagnosis.healing import follow, heal, heal_between
+from haltere.diagnosis.model_detectors import BY_BAROMETER, BY_POSITION, BY_VELOCITY, outside, spoke, testify
 from haltere.diagnosis.steps import refuted, shown
 from haltere.filter import jumping, turning
 from haltere.filter.signatures import (
@@ -61,8 +62,8 @@ SUDDEN = 0.5
 LASTS = 1.2
 #: By how much a name must exceed the others; and for an axis of the gyro against that of the accelerometer which looks most like it.
 MARGIN, MARGIN_ALIKE = 9.0, 16.0
-#: What it says for an axis that the raw samples show its step, or the rotors do; margins as a part of the statistic, since responses are linear and
-#: onsets on a grid.
+#: What it says for an axis that the raw samples show its step, or the rotors do; margins as a part of the statistic, since responses are
+#: linear and onsets on a grid.
 SHOWN, LINEAR = 25.0, 0.02
 #: Part of a threshold that is enough where rotors alarmed by themselves for the same axis, sign and onset: both would have to be wrong.
 TWO_WITNESSES = 0.6
@@ -248,6 +249,20 @@ def tick(s: Any, prm: Any, dt: float) -> bool:
 
 
 @jit
+def said(s: Any, g: int, onset: float) -> float:
+    """When the vehicle's model found what measures GNSS or height wrong since ``onset``, if it did; else -1."""
+    if g < F_VELOCITY or g == F_COMPASS:
+        return -1.0
+    return spoke(s, BY_VELOCITY if g < F_POSITION else (BY_POSITION if g < F_COMPASS else BY_BAROMETER), onset)
+
+
+@jit
+def doubled(s: Any, g: int, onset: float) -> float:
+    """Factor on the threshold of what is no inertial sensor; none where the vehicle's model says the same."""
+    return 1.0 if g < F_VELOCITY or said(s, g, onset) >= 0.0 else OTHERS
+
+
+@jit
 def usual(b: Any, g: int) -> float:
     """Factor on the threshold of a family from what its statistic has come to in this flight: innovations are not white."""
     return max(1.0, BEYOND_USUAL * b.usual[g])
@@ -282,9 +297,10 @@ def weigh(s: Any, prm: Any) -> tuple[int, float]:
         for k in range(SLOTS):
             j = f * SLOTS + k
             den = b.den[j]
-            tolerance, h = usually, prm.diagnosis_threshold * (1.0 if g < F_VELOCITY else OTHERS)
-            if f == BAROMETER_OFFSET and jumps.settled(b.height, b.onset[k]):  # the flight's own barometer says that it is no gust
-                tolerance, h = min(tolerance, LATE * b.sank), prm.diagnosis_threshold
+            tolerance = usually
+            stepped = f == BAROMETER_OFFSET and jumps.settled(b.height, b.onset[k])  # the flight's own barometer says that it is no gust
+            if stepped:
+                tolerance = min(tolerance, LATE * b.sank)
             num = abs(b.num[j])
             if num * num > least * den and den > LEAST:
                 span = GRID + 0.2 * (s.t - b.onset[k])
@@ -300,6 +316,7 @@ def weigh(s: Any, prm: Any) -> tuple[int, float]:
                         turned = b.heading_num[j] * b.heading_num[j] / max(b.heading_den[j], 1e-9)
                 if num <= tolerance * den:
                     continue
+                h = prm.diagnosis_threshold * (1.0 if stepped else doubled(s, g, b.onset[k]))
                 beyond = (level - tolerance * (2.0 * num - tolerance * den)) / h
                 b.beyond[g] = max(b.beyond[g], beyond)
                 if g < F_VELOCITY and g != VERTICAL and beyond > b.ratio:
@@ -367,7 +384,7 @@ def judge(s: Any, prm: Any) -> bool:
         return False
     if not doubt.may_name(b, lead, s.t) or not doubt.judged(s) or not doubt.fits(s, b.fault[lead] * SLOTS + k, k):
         return False  # what is wrong is in no list
-    if lead < F_VELOCITY and not changed(s, prm, b.fault[lead], k):
+    if lead < F_VELOCITY and (outside(s, b.onset[k]) or not changed(s, prm, b.fault[lead], k)):
         return False
     candidates, others = 1 << lead, 0
     top = b.level[lead]
@@ -396,16 +413,18 @@ def tell(s: Any, prm: Any, code: Any, g: int, candidates: int) -> None:
     f, k = b.fault[g], b.slot[g]
     j = f * SLOTS + k
     n = s.n_events
-    threshold = prm.diagnosis_threshold * (1.0 if g < F_VELOCITY else OTHERS) * usual(b, g)
+    threshold = prm.diagnosis_threshold * doubled(s, g, b.onset[k]) * usual(b, g)
     event_since(s, s.t, b.onset[k], code, NO_SENSOR, b.level[g], threshold, f)
     if s.n_events > n:
         e = s.event[n]
         e.seen, e.size, e.sd, e.candidates = max(b.t_seen, b.onset[k]), b.num[j] / b.den[j], 1.0 / math.sqrt(b.den[j]), candidates
-        hint = pairs.hinted(s, g, b.onset[k], b.num[j]) if g < F_VELOCITY else -1.0  # the vehicle's model said so before
+        # the vehicle's model said so before
+        hint = pairs.hinted(s, g, b.onset[k], b.num[j]) if g < F_VELOCITY else said(s, g, b.onset[k])
         if hint >= 0.0:
             e.seen = min(e.seen, hint)
         if g == F_BAROMETER and jumps.stepped(b.height, b.onset[k]):
             e.onset, e.seen = b.height.onset, b.height.t_alarm
+        testify(s, e, b.onset[k])
         e.left = doubt.left(b, j, k) / max(b.num[j] * b.num[j] / b.den[j], 1e-9)
 
 

@@ -19,6 +19,7 @@ from haltere.aids.compass import OUT_TURN
 from haltere.aids.record import E_FAULT, E_OVER, E_SUSPECT, NO_SENSOR, event_since
 from haltere.diagnosis import doubt
 from haltere.diagnosis.drifts import LASTS, forget_means, lasting
+from haltere.diagnosis.model_detectors import testify
 from haltere.diagnosis.pairs import BLOCK, CALM_ENOUGH, calm_again, change, listen, shift_bias, would_show
 from haltere.diagnosis.rate_step import began, shape
 from haltere.diagnosis.stand_in import density_of_noise, mark_before, offset_variance
@@ -218,6 +219,7 @@ def tell(s: Any, code: Any, detail: Any, size: float, sd: float, candidates: int
         for i in range(6):
             if p.t_alarm[i] != 0.0:
                 e.alarms[i] = p.t_alarm[i]
+        testify(s, e, p.onset)
 
 
 @jit

@@ -24,7 +24,7 @@ from haltere.core.rotation import Mat, Vec, dcm
 from haltere.filter.update import NONE, project, variance
 from haltere.vehicle.linear import linear
 
-__all__ = ["across", "couple", "forget", "hold", "stand_in", "stands", "twist_column"]
+__all__ = ["across", "couple", "forget", "hold", "stand_in", "stands", "twist_column", "with_lift"]
 
 #: In the air: thrust of the model above this part of gravity (theory-amendments.md §19), and so high above where it last rested [m].
 LEAST_THRUST, LIFTED = 0.5, 0.5
@@ -120,6 +120,19 @@ def hold(s: Any, w0: Vec, f0: Vec, w1: Vec, f1: Vec) -> tuple[Vec, Vec]:
 
 
 @jit
+def with_lift(s: Any, speed: Any, f: Vec, a: Vec) -> tuple[Vec, Vec]:
+    """Force and angular acceleration with what rotors were found to have more than their speeds stand for."""
+    p, m = s.pairs[0], s.model[0]
+    if p.lifted == 1:
+        for k in range(min(len(speed), len(p.lift))):
+            o2 = speed[k] * speed[k] * p.ratio
+            f = (f[0], f[1], f[2] + p.lift[k] * m.k[2, 0] * o2)
+            t = p.lift[k] * o2
+            a = (a[0] + t * m.k[3, 0] * m.roll[k], a[1] + t * m.k[4, 0] * m.pitch[k], a[2] + p.torque[k] * o2 * m.k[5, 0] * m.yaw[k])
+    return f, a
+
+
+@jit
 def evaluate(s: Any, prm: Any, w: Vec, dt: float) -> None:
     """The model at the state's time, with the rate ``w`` [rad/s], and whether the vehicle is in the air."""
     p, m = s.pairs[0], s.model[0]
@@ -128,12 +141,7 @@ def evaluate(s: Any, prm: Any, w: Vec, dt: float) -> None:
     v = air_velocity(s, dcm((s.q[0], s.q[1], s.q[2], s.q[3])), (s.v[0], s.v[1], s.v[2]))
     eta = (p.m[0], p.m[1], p.m[2]) if m.literal == 1 else w
     f, a, D_v, _, M_v, M_w = linear(m, s.speed, s.spin_up, v, w, eta, p.ratio)
-    if p.lifted == 1:
-        for k in range(min(len(s.speed), len(p.lift))):
-            o2 = s.speed[k] * s.speed[k] * p.ratio
-            f = (f[0], f[1], f[2] + p.lift[k] * m.k[2, 0] * o2)
-            t = p.lift[k] * o2
-            a = (a[0] + t * m.k[3, 0] * m.roll[k], a[1] + t * m.k[4, 0] * m.pitch[k], a[2] + p.torque[k] * o2 * m.k[5, 0] * m.yaw[k])
+    f, a = with_lift(s, s.speed, f, a)
     for i in range(3):
         p.f[i], p.m[i], p.v_a[i] = f[i], a[i], v[i]
         p.turn[i] += a[i] * dt

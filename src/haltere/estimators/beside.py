@@ -6,7 +6,7 @@ from typing import Any
 
 from haltere._jit import jit, where
 from haltere.core.rotation import Mat, Vec
-from haltere.diagnosis import inertial, model_faults, pairs, stand_in, steps
+from haltere.diagnosis import inertial, model_detectors, model_faults, pairs, stand_in, steps
 from haltere.filter.rotors import rotors_at
 
 __all__ = ["across", "begin_anew", "carry", "compare", "couple", "diagnose", "hold", "turning"]
@@ -20,6 +20,7 @@ def _compare(s: Any, prm: Any, w0: Vec, f0: Vec, w1: Vec, f1: Vec, dt: float) ->
     s.f_raw[0], s.f_raw[1], s.f_raw[2] = f1
     if pairs.gather(s, prm, w_raw, f_raw, dt):
         model_faults.hear(s, prm)
+    model_detectors.drive(s, prm, dt)
     return w0, f0, w1, f1
 
 
@@ -63,6 +64,7 @@ def _no_hold(s: Any, w0: Vec, f0: Vec, w1: Vec, f1: Vec) -> tuple[Vec, Vec]:
 def _begin_anew(s: Any) -> None:
     stand_in.forget(s)
     pairs.restart(s)
+    model_detectors.forget(s)
 
 
 @jit

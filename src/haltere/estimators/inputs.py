@@ -26,6 +26,7 @@ from haltere.aids.record import (
     WIND,
 )
 from haltere.core.earth import pressure_altitude
+from haltere.diagnosis.model_detectors import HEARD
 from haltere.diagnosis.pairs import BLOCK, STEPS_TOO
 from haltere.errors import UsageError
 from haltere.estimators.air import air_from_vanes, given_wind, steady_wind
@@ -44,6 +45,11 @@ FloatArray = NDArray[np.float64]
 
 #: How far the fusion horizon runs behind the largest delay [s] (theory-amendments.md §8).
 HORIZON_MARGIN = 0.05
+#: Fields of the parameter record that follow from keys.
+DERIVED = (
+    "horizon", "covariance_interval", "imu_mean", "diagnosis_threshold", "diagnosis_pair_threshold", "diagnosis_chain_single",
+    "diagnosis_chain_triple",
+)  # fmt: skip
 #: Faults that are told apart, judgements of them a second, and the factor for innovations that are not white.
 FAMILIES, JUDGEMENTS, COLOURED = 14.0, 10.0, 1.0
 
@@ -169,7 +175,7 @@ def parameters(config: Config) -> NDArray[np.void]:
     """Parameter record, one element, of a configuration."""
     record = as_records(np.zeros(1, PARAMETERS))
     for name in PARAMETERS.names or ():
-        if name in ("horizon", "covariance_interval", "imu_mean", "diagnosis_threshold", "diagnosis_pair_threshold"):
+        if name in DERIVED:
             continue
         head = next((h for h in ("two_stage", "wind_attitude", "fault_tolerant") if name.startswith(f"{h}_")), name.partition("_")[0])
         record[name] = config.number(f"{head}.{name[len(head) + 1 :]}")
@@ -178,6 +184,8 @@ def parameters(config: Config) -> NDArray[np.void]:
     record["covariance_interval"] = 0.1
     record["diagnosis_threshold"] = alarm_level(config.number("diagnosis.false_alarms"))
     record["diagnosis_pair_threshold"] = glr_level(config.number("diagnosis.false_alarms"), (3.0 + 3.0 * STEPS_TOO) / BLOCK, 1)
+    for name, d in (("single", 1), ("triple", 3)):
+        record[f"diagnosis_chain_{name}"] = glr_level(config.number("diagnosis.false_alarms"), sum(HEARD), d)
     return record
 
 

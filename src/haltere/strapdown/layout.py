@@ -14,6 +14,7 @@ import numpy as np
 from haltere._jit import constant
 from haltere.core.lumped import lumped_layout
 from haltere.strapdown.bank import bank
+from haltere.strapdown.model_chain import chain
 from haltere.strapdown.pairs import pairs
 
 __all__ = [
@@ -240,7 +241,7 @@ EVENT = _record(
     ("sd", "f8"),
     ("candidates", "i8"),
     ("left", "f8"),  # what it leaves unexplained, as a part of what it explains
-    ("alarms", "f8", 6),  # when each pair of model and IMU alarmed [s], NaN: not
+    ("alarms", "f8", 10),  # when each pair of model and IMU, and then J21 to J24, alarmed [s], NaN: not
 )
 
 #: A first stage: the part of a state that prediction and updates touch, with the core states only.
@@ -300,6 +301,7 @@ PARAMETERS = np.dtype(
             "two_stage_haversine two_stage_height_sign "
             "diagnosis_inertial diagnosis_gyro diagnosis_accel diagnosis_threshold "
             "diagnosis_vehicle diagnosis_force diagnosis_moment diagnosis_pair_threshold "
+            "diagnosis_chain_single diagnosis_chain_triple "
             "wind_attitude_integrator wind_attitude_residual wind_attitude_rows wind_attitude_normalise wind_attitude_angles "
             "wind_attitude_accel wind_attitude_force wind_attitude_acceleration wind_attitude_gate wind_attitude_air "
             "fault_tolerant_detector fault_tolerant_reset fault_tolerant_wind fault_tolerant_biases fault_tolerant_isolate "
@@ -412,6 +414,7 @@ def layout(
             *_of_rotors(rotors),
             ("ft", _record(("on", "i8")) if beside is None else beside, (0 if beside is None else 1,)),
             ("pairs", pairs(), (1 if twist else 0,)),
+            ("chain", chain(rotors), (1 if twist else 0,)),
             ("ring_head", "i8", N_QUEUES),
             ("ring_n", "i8", N_QUEUES),
             ("ring", MEASUREMENT, (N_QUEUES, MEASUREMENT_CAPACITY)),
