@@ -53,7 +53,7 @@ QUICK, SETTLED, LEAST_SCALE, MOST_SCALE = 0.2, 0.02, 0.01, 4.0
 #: As in `haltere.diagnosis.inertial`: over how many usual ones a threshold is, stretch [s], how fast that is learnt, its bound.
 BEYOND_USUAL, STRETCH, RISE, FALL, CAP = 2.0, 10.0, 0.6, 0.1, 2.0
 #: Part of its threshold at which a force is looked at: what is made of it has a test of its own (`haltere.diagnosis.model_faults`).
-LOOK = 0.5
+LOOK = 0.4
 #: What is left of the largest moment of late, a block.
 HARD_FOR = 0.98
 #: Forces are compared in the wind of so long ago [s].
