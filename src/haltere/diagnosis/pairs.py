@@ -34,6 +34,7 @@ __all__ = [
     "shift_bias",
     "vouch",
     "would_show",
+    "yaw",
 ]
 
 #: A block, and time between marks of the past [s].
@@ -305,6 +306,13 @@ def by_lag(s: Any) -> Vec:
 
 
 @jit
+def yaw(s: Any) -> float:
+    """Heading [rad]."""
+    C = dcm((s.q[0], s.q[1], s.q[2], s.q[3]))
+    return math.atan2(C[1][0], C[0][0])
+
+
+@jit
 def remember(s: Any, prm: Any) -> None:
     """Mark the past: what the chains are now."""
     p = s.pairs[0]
@@ -317,7 +325,7 @@ def remember(s: Any, prm: Any) -> None:
     for i in range(3):
         p.m_turn[k, i] = p.turn[i]
     W = wind_n(s)
-    p.m_wind[k, 0], p.m_wind[k, 1] = W[0], W[1]
+    p.m_wind[k, 0], p.m_wind[k, 1], p.m_yaw[k] = W[0], W[1], yaw(s)
     p.lag = mark_before(p, s.t - LAG)
     if p.lag >= 0 and p.m_t[p.lag] < p.t_across:  # levels begin anew with a verdict: in the wind of then
         p.lag = -1
