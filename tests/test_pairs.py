@@ -44,20 +44,35 @@ def told(of: Vehicle, word: str, mission: str = "box", end: float = 8.0, **wind:
         (f"model.t:bias=0.8m/s2@{AT:g}", "model", "t", ["model.t"]),
         (f"rotor.3:thrust=0.85@{AT:g}", "rotors", "3", ["rotor.3", "rotors.3"]),
         (f"rotors.0:scale=1.04@{AT:g}", "rotors", "0", ["rotor.0", "rotors.0"]),
+        (f"rotors.0:scale=1.02@{AT:g}", "rotors", "0", ["rotor.0", "rotors.0"]),
+        (f"model.hy:bias=-0.8m/s2@{AT:g}", "model", "hy", ["model.hy"]),
+        (f"model.hx:bias=0.8m/s2@{AT:g}", "model", "hx", ["model.hx"]),
     ],
 )
 def test_faults_of_model_and_rotor_are_named(identified: Vehicle, word: str, sensor: str, axis: str, candidates: list[str]) -> None:
     e, *later = told(identified, word)
     assert not later
     assert (e["sensor"], e["axis"], e["candidates"]) == (sensor, axis, candidates)
-    named = 2.5 if axis == "t" else (1.1 if sensor == "rotors" else 0.6)  # opposite rotors may explain alike: looked at for longer
+    named = 4.0 if axis in ("t", "hx", "hy") else 0.6
     assert 0.0 <= e["t_detected"] - AT < 0.25 and e["t_isolated"] - AT < named
     assert e["statistic"] > e["threshold"] and "silent" in e["evidence"] and "J1" in e["evidence"]
 
 
-def test_an_accelerometer_is_not_taken_for_the_model(identified: Vehicle) -> None:
-    (e,) = told(identified, f"accel.z:bias=0.8m/s2@{AT:g}")
+@pytest.mark.parametrize("size", [0.8, 0.4])
+def test_an_accelerometer_is_not_taken_for_the_model(identified: Vehicle, size: float) -> None:
+    (e,) = told(identified, f"accel.z:bias={size}m/s2@{AT:g}")
     assert e["candidates"] == ["accel.z"]
+
+
+def test_small_forces_are_found_in_still_air(identified: Vehicle) -> None:
+    (e,) = told(identified, f"model.t:bias=0.4m/s2@{AT:g}", "hover")
+    assert e["candidates"] == ["model.t"] and e["t_isolated"] is not None
+
+
+def test_in_hover_a_force_along_an_axis_and_a_wind_along_it_are_both_named(identified: Vehicle) -> None:
+    for word in (f"model.hx:bias=0.8m/s2@{AT:g}", f"wind.n:step=2m/s@{AT:g}"):
+        (e,) = told(identified, word, "hover")
+        assert e["candidates"] == ["model.hx", "wind"] and e["t_isolated"] is None
 
 
 def test_a_gyro_that_steps_is_named_at_once(identified: Vehicle) -> None:

@@ -47,8 +47,8 @@ COMPARED = 2.5
 #: By how much a hypothesis must explain better, in twice the log likelihood; what a signature is off by itself, and least 1 sigma.
 MARGIN, LIKE, LEAST_M, LEAST_F = 9.0, 0.2, 0.15, 0.04
 #: A change that is the wind beyond doubt, soon; what a force must explain better than what the model is off by in this flight, and less
-#: than what it is not looked at any longer.
-SURE, WORTH, LITTLE = 40.0, 24.0, 6.0
+#: than what a second it is not looked at any longer.
+SURE, WORTH, LITTLE = 40.0, 20.0, 4.0
 #: Two rotors that explain alike within the first are both named, within the second they are looked at for longer.
 NEARLY, UNLIKE = 1.0, 3.0
 #: A moment that has lasted for so long [s] before its alarm is dated anew.
@@ -63,8 +63,9 @@ STILL, STILL_FOR, BEYOND_GUSTS = 1.5, 15.0, 4.0
 #: Vertical gusts beside horizontal ones; drag by wind that an unknown one may have [1/s].
 DOWN, TYPICAL_DRAG = 0.5, 0.3
 #: What must speak against an accelerometer's fault of the size, in twice the log likelihood: that one of size² D = d would do so by chance
-#: has the probability Φ(-(d + 16)/(2 √d)), at most that of four sigma; by what part the size may be off.
-AGAINST, ABOUT = 16.0, 0.3
+#: has the probability Φ(-(d + 16)/(2 √d)), at most that of four sigma; by what part the size may be off: a few blocks have told it. An onset
+#: of the bank is one of the pair if so near [s].
+AGAINST, ABOUT, NEAR = 16.0, 0.3, 0.5
 #: How long forces are not listened to [s]: after a verdict, after a change of the wind, and where there was nothing.
 DEAF, SOON, BRIEFLY = 5.0, 1.5, 0.5
 #: A fault is over when the change is its reverse within this part.
@@ -384,20 +385,23 @@ def silent(s: Any, prm: Any, a: int, size: float) -> int:
     if len(s.bank) == 0:
         return 0
     b = s.bank[0]
-    slot, near = -1, 1e18
+    near = 1e18
     for k in range(len(b.live)):
-        if b.live[k] == 1 and abs(b.onset[k] - p.onset) < near:
-            slot, near = k, abs(b.onset[k] - p.onset)
-    if slot < 0 or near > 0.5:
+        if b.live[k] == 1:
+            near = min(near, abs(b.onset[k] - p.onset))
+    if near > NEAR:
         return 0
-    j = (ACCEL + a) * SLOTS + slot
-    h = prm.diagnosis_threshold
-    level = b.num[j] * b.num[j] / max(b.den[j], 1e-9)
-    if level > h:
-        return -1
-    likely = b.num[j] / max(b.den[j], 1e-9) * math.copysign(1.0, size)  # of about that size: a few blocks have told it
-    likely = math.copysign(min(max(likely, (1.0 - ABOUT) * abs(size)), (1.0 + ABOUT) * abs(size)), size)
-    return 1 if 2.0 * likely * b.num[j] - likely * likely * b.den[j] < -AGAINST else 0
+    for k in range(len(b.live)):  # it may have begun with the window that alarmed, or with the alarm
+        if b.live[k] == 0 or (abs(b.onset[k] - p.onset) > near and (b.onset[k] < p.onset or b.onset[k] > p.t_first + AROUND)):
+            continue
+        j = (ACCEL + a) * SLOTS + k
+        if b.num[j] * b.num[j] > prm.diagnosis_threshold * max(b.den[j], 1e-9):
+            return -1
+        likely = b.num[j] / max(b.den[j], 1e-9) * math.copysign(1.0, size)
+        likely = math.copysign(min(max(likely, (1.0 - ABOUT) * abs(size)), (1.0 + ABOUT) * abs(size)), size)
+        if 2.0 * likely * b.num[j] - likely * likely * b.den[j] > -AGAINST:
+            return 0
+    return 1
 
 
 @jit
@@ -441,7 +445,7 @@ def of_forces(s: Any, prm: Any, since: float) -> None:
         settle_forces(s, SOON)
         return
     small = abs(size) < max(0.5 * prm.diagnosis_force, BEYOND_GUSTS * by_gusts(s, prm, a))
-    if since > 1.0 and (small or (worth < LITTLE and since > 1.5)):  # gusts, chance, or gone by itself
+    if since > 1.0 and (small or (since > 1.5 and worth < LITTLE * min(since, 3.0))):  # gusts, chance, or gone by itself
         settle_forces(s, BRIEFLY)
         return
     if len(s.bank) > 0 and s.bank[0].alarm != 0 and since < WAIT:  # an inertial fault is about to be named

@@ -35,6 +35,7 @@ __all__ = [
     "shift_bias",
     "vouch",
     "would_show",
+    "yaw",
 ]
 
 #: A block, and time between marks of the past [s].
@@ -57,7 +58,7 @@ MOST_RHO, MOST_GAIN = 0.9, 0.95
 #: As in `haltere.diagnosis.inertial`: over how many usual ones a threshold is, stretch [s], how fast that is learnt, its bound.
 BEYOND_USUAL, STRETCH, RISE, FALL, CAP = 2.0, 10.0, 0.6, 0.1, 2.0
 #: Part of its threshold at which a force is looked at: what is made of it has a test of its own (`haltere.diagnosis.model_faults`).
-LOOK = 0.5
+LOOK = 0.4
 #: What is left of the largest moment of late, a block.
 HARD_FOR = 0.98
 #: Forces are compared in the wind of so long ago [s].
@@ -345,6 +346,13 @@ def by_lag(s: Any) -> Vec:
 
 
 @jit
+def yaw(s: Any) -> float:
+    """Heading [rad]."""
+    C = dcm((s.q[0], s.q[1], s.q[2], s.q[3]))
+    return math.atan2(C[1][0], C[0][0])
+
+
+@jit
 def remember(s: Any, prm: Any) -> None:
     """Mark the past: what the chains are now."""
     p = s.pairs[0]
@@ -357,7 +365,7 @@ def remember(s: Any, prm: Any) -> None:
     for i in range(3):
         p.m_turn[k, i] = p.turn[i]
     W = wind_n(s)
-    p.m_wind[k, 0], p.m_wind[k, 1] = W[0], W[1]
+    p.m_wind[k, 0], p.m_wind[k, 1], p.m_yaw[k] = W[0], W[1], yaw(s)
     p.lag = mark_before(p, s.t - LAG)
     if p.lag >= 0 and p.m_t[p.lag] < p.t_across:  # levels begin anew with a verdict: in the wind of then
         p.lag = -1

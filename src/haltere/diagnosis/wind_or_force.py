@@ -17,6 +17,7 @@ from typing import Any
 from haltere._jit import constant, jit
 from haltere.core.rotation import Vec, dcm, tmat_vec
 from haltere.diagnosis.drifts import LASTS, lasting, walk_of
+from haltere.diagnosis.pairs import yaw
 from haltere.vehicle.linear import linear
 
 __all__ = ["WIND", "best", "by_chance", "follow", "start"]
@@ -38,13 +39,14 @@ def start(s: Any) -> None:
     p.trial, p.both = 1, 0
     for i in range(4):
         p.misfit[i], p.chance[i] = 0.0, 0.0
-    p.moved, p.heading = 0.0, yaw(s)
+    p.moved, p.turned, p.heading = 0.0, 0.0, p.m_yaw[p.mark]
+    turned = turn(s)
     for i in range(STATES):
         p.blown[i] = 0.0
         for j in range(STATES):
             p.blown_P[i, j] = 0.0
     for i in range(3):
-        v = p.m_var[p.mark, i] + LEAST * LEAST
+        v = p.m_var[p.mark, i] + LEAST * LEAST + turned * by_old_wind(s, i)
         p.push[i], p.push_var[i], p.off[i], p.off_var[i] = 0.0, v + FORCE * FORCE, 0.0, v
         p.pushed[i], p.unpushed[i] = 0.0, 0.0
         p.blown_P[2 + i, 2 + i] = v
@@ -54,10 +56,27 @@ def start(s: Any) -> None:
 
 
 @jit
-def yaw(s: Any) -> float:
-    """Heading [rad]."""
-    C = dcm((s.q[0], s.q[1], s.q[2], s.q[3]))
-    return math.atan2(C[1][0], C[0][0])
+def by_old_wind(s: Any, i: int) -> float:
+    """Variance of what a turn by 1 rad makes of the error of the wind before, which was taken for what the model is off by [m^2/s^4]."""
+    p, o = s.pairs[0], 15 + len(s.baro) + len(s.mag)
+    if i == FORCES - 1 or len(s.wind) == 0:
+        return 0.0
+    slope = p.by_v[0, i, i]
+    if len(s.drag) > 0:
+        slope /= math.exp(s.drag[0])
+    return float(slope * slope * 0.5 * (s.P[o, o] + s.P[o + 1, o + 1]))
+
+
+@jit
+def turn(s: Any) -> float:
+    """Take the heading; by how much the square of the largest turn since the mark has grown [rad^2]."""
+    p = s.pairs[0]
+    change = yaw(s) - p.heading
+    turned = min(abs(math.atan2(math.sin(change), math.cos(change))), 1.5)
+    before = p.turned
+    p.turned = max(p.turned, turned)
+    p.moved = max(p.moved, math.sqrt(s.v[0] * s.v[0] + s.v[1] * s.v[1]) / FAST, turned / TURNED)
+    return float(p.turned * p.turned - before * before)
 
 
 @jit
@@ -87,11 +106,9 @@ def follow(s: Any, dt: float) -> None:
     f_0 = linear(m, s.speed, s.spin_up, through_air(s, p.wind[0], p.wind[1]), ZERO, ZERO, p.ratio)[0]
     r = (left(p, 0, f_0[0] - f_now[0]), left(p, 1, f_0[1] - f_now[1]), left(p, 2, f_0[2] - f_now[2]))
     R = (white(s, 0, dt), white(s, 1, dt), white(s, 2, dt))
-    change = yaw(s) - p.heading
-    turned = abs(math.atan2(math.sin(change), math.cos(change)))
-    p.moved = max(p.moved, math.sqrt(s.v[0] * s.v[0] + s.v[1] * s.v[1]) / FAST, turned / TURNED)
+    turned = turn(s)
     for i in range(FORCES):  # with a force along the axis, and with no more than what the model is off by
-        q = walk_of(s, i) * dt
+        q = walk_of(s, i) * dt + turned * by_old_wind(s, i)
         p.push_var[i] += q
         S = p.push_var[i] + R[i]
         x = r[i] - p.push[i]

@@ -122,8 +122,9 @@ def pairs() -> np.dtype[np.void]:
                 ("both", "i8"),  # 1: that it is one or the other was told
                 ("misfit", "f8", 4),
                 ("chance", "f8", 4),
-                ("moved", "f8"),  # most of what is no hover any more, speed or turn since, and the heading then
+                ("moved", "f8"),  # most of what is no hover any more, speed or turn since, and the heading before
                 ("heading", "f8"),
+                ("turned", "f8"),  # largest turn since [rad]
                 ("pushed", "f8", 3),
                 ("unpushed", "f8", 3),
                 ("push", "f8", 3),
@@ -155,6 +156,7 @@ def pairs() -> np.dtype[np.void]:
                 ("m_turn", "f8", (int(MARKS), 3)),
                 ("m_var", "f8", (int(MARKS), 6)),
                 ("m_wind", "f8", (int(MARKS), 2)),
+                ("m_yaw", "f8", int(MARKS)),
             ],
         ),
         align=True,
