@@ -40,6 +40,9 @@ CANDIDATES = (
 B_WIND, B_ACCEL, B_GYRO, B_ROTOR, B_TACHOMETER, B_COMPASS = (constant(i) for i in (6, 7, 10, 13, 21, 29))
 #: When a change is looked at first, and when a verdict on moments is given [s]; how long one on forces may wait, and one on a rotor.
 EARLY, COLLECT, WAIT, LONGER = 0.08, 0.3, 6.0, 2.0
+#: For how long after its onset a change of a rate may be looked at, where a step is not told from a ramp before, or a moment is too small
+#: yet [s]: its blocks are kept so long.
+UNDECIDED = 0.5
 #: How long a force and wind are compared at the most before both are named [s].
 COMPARED = 2.5
 #: By how much a hypothesis must explain better, in twice the log likelihood; what a signature is off by itself, and least 1 sigma.
@@ -286,6 +289,8 @@ def of_moments(s: Any, prm: Any) -> bool:
             if better > MARGIN and abs(step) > prm.diagnosis_gyro and p.calm <= CALM_ENOUGH:
                 name_gyro(s, i - R)
                 return True
+            if better > -MARGIN and s.t < p.onset + UNDECIDED:
+                return False
             if better > -MARGIN:
                 return True  # it may be the gyro's: the bank will say so
     first, other, least, second, thrust = -1, -1, 1e18, 1e18, 0.0
@@ -344,7 +349,8 @@ def of_moments(s: Any, prm: Any) -> bool:
     size, sd = (m_r, s_r) if axis == R else ((m_p, s_p) if axis == P else (m_q, s_q))
     if abs(size) > least_moment:
         conclude(s, axis, MODEL + axis, size, sd, UP << axis, E_FAULT)
-    return True
+        return True
+    return bool(s.t >= p.onset + UNDECIDED)
 
 
 @jit
