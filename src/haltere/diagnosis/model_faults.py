@@ -25,6 +25,7 @@ from haltere.diagnosis.rate_step import began, shape
 from haltere.diagnosis.stand_in import density_of_noise, mark_before, offset_variance
 from haltere.diagnosis.wind_or_force import WIND, best, by_chance, follow, start
 from haltere.filter.signatures import ACCEL, SLOTS, clear
+from haltere.strapdown.pairs import LATELY
 from haltere.strapdown.propagate import gusts, inject
 
 __all__ = ["CANDIDATES", "MODEL", "ROTOR", "hear"]
@@ -42,6 +43,11 @@ CANDIDATES = (
 B_WIND, B_ACCEL, B_GYRO, B_ROTOR, B_TACHOMETER, B_COMPASS = (constant(i) for i in (6, 7, 10, 13, 21, 29))
 #: When a change is looked at first, and when a verdict on moments is given [s]; how long one on forces may wait, and one on a rotor.
 EARLY, COLLECT, WAIT, LONGER = 0.08, 0.3, 6.0, 2.0
+#: Blocks that say how large a moment is.
+FEW = constant(6)
+#: For how long after its onset a change of a rate may be looked at, where a step is not told from a ramp before, or a moment is too small
+#: yet [s]: its blocks are kept so long.
+UNDECIDED = 0.5
 #: How long a force and wind are compared at the most before both are named [s].
 COMPARED = 2.5
 #: By how much a hypothesis must explain better, in twice the log likelihood; what a signature is off by itself, and least 1 sigma.
@@ -233,6 +239,18 @@ def moment_of(s: Any, i: int) -> tuple[float, float]:
 
 
 @jit
+def lately(s: Any, i: int) -> float:
+    """The same moment from the last blocks as they are: a chain follows a ramp late, by its slope over its gain."""
+    p = s.pairs[0]
+    rate, when = 0.0, 0.0
+    for k in range(p.n_lately - FEW, p.n_lately):
+        rate += p.lately[k % LATELY, i - FORCES] / FEW
+        when += p.t_lately[k % LATELY] / FEW
+    rate -= p.m_level[p.mark, i] + p.m_drift[p.mark, i] * (when - p.m_t[p.mark])
+    return float(rate / max(when - p.onset, EARLY))
+
+
+@jit
 def ended(p: Any, bit: int, k: int, size: float) -> bool:
     """Whether a change is the end of the fault ``k`` that lasts."""
     return (p.wrong >> bit) & 1 == 1 and abs(size + p.was[k]) < REVERSE * abs(p.was[k])
@@ -297,6 +315,8 @@ def of_moments(s: Any, prm: Any) -> bool:
             if better > MARGIN and abs(step) > prm.diagnosis_gyro and p.calm <= CALM_ENOUGH:
                 name_gyro(s, i - R)
                 return True
+            if better > -MARGIN and s.t < p.onset + UNDECIDED:
+                return False
             if better > -MARGIN:
                 return True  # it may be the gyro's: the bank will say so
     first, other, least, second, thrust = -1, -1, 1e18, 1e18, 0.0
@@ -355,10 +375,11 @@ def of_moments(s: Any, prm: Any) -> bool:
         conclude(s, 6 + first, ROTOR + first, thrust, 0.02, bits, E_FAULT)
         lift(s, first, thrust, m_q, s_q)
         return True
-    size, sd = (m_r, s_r) if axis == R else ((m_p, s_p) if axis == P else (m_q, s_q))
+    size, sd = lately(s, axis), s_r if axis == R else (s_p if axis == P else s_q)
     if abs(size) > least_moment:
         conclude(s, axis, MODEL + axis, size, sd, UP << axis, E_FAULT)
-    return True
+        return True
+    return bool(s.t >= p.onset + UNDECIDED)
 
 
 @jit
