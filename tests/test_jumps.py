@@ -9,9 +9,12 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from haltere import run
 from haltere._jit import COMPILED
 from haltere.diagnosis import jumps
 from haltere.filter import jumping
+from haltere.metrics.detection import alarms
+from haltere.simulate import Scenario, inject, simulate
 from haltere.strapdown.layout import layout
 
 FloatArray = NDArray[np.float64]
@@ -114,3 +117,16 @@ def test_squares_of_step_and_rise_are_those_of_least_squares() -> None:
     assert gain == pytest.approx(step - rise, rel=1e-9)
     assert abs(when - onset) < 0.3
     assert size == pytest.approx(2.0, abs=0.8)
+
+
+@pytest.mark.parametrize(("mission", "wind"), [("hover", {}), ("lissajous", {"n": 5.2, "e": 3.0, "gust": 1.2})])
+def test_small_steps_of_barometer_and_compass_are_named_in_flight(mission: str, wind: dict[str, float]) -> None:
+    """Half of the truth table's sizes: 1.5 m, and a field that turns the compass by ten degrees; nothing is named in the flight without."""
+    calm = simulate(Scenario(mission=mission, scale=0.55, duration=30.0, seed=62001, wind=wind, landing=False))
+    assert not alarms(run(calm, scored=False).events)
+    for word, sensor in (("barometer:bias=1.5m", "barometer"), ("magnetometer:disturb=0.08", "magnetometer")):
+        events = alarms(run(inject(calm, [f"{word}@24.1"]), scored=False).events)
+        assert [e["candidates"] for e in events] == [[sensor]]
+        assert 0.0 <= events[0]["t_detected"] - 24.1 < 0.6
+        assert abs(events[0]["t_onset"] - 24.1) < 0.3
+        assert events[0]["t_isolated"] - 24.1 < 3.0

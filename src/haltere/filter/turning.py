@@ -37,7 +37,7 @@ TOGETHER = 2.0
 AROUND = math.radians(0.1)
 #: Length of the means that are to be white [s], how late they are taken, so that a fault does not hide itself, the most that one counts,
 #: how fast and how far they move the share of the compass' own turning.
-BLOCK, LATE, MOST, FASTER, LEAST_SHARE, MOST_SHARE = 1.0, constant(8), 6.0, 0.3, 0.02, 100.0
+BLOCK, LATE, MOST, FASTER, LEAST_SHARE, MOST_SHARE = 1.0, constant(8), 6.0, 0.1, 0.02, 100.0
 #: A whitened one counts up to so many sigma, more by this factor of the one before; columns worked on together.
 ALONE, FOLLOWED, WIDTH = 4.0, 1.2, 60
 
