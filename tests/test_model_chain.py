@@ -282,8 +282,8 @@ def test_signatures_and_their_order(mission: str) -> None:
         assert set(found) == {name} and 0.0 <= found[name] < most, (word, found)
     for word, least, most in (("model.r:bias=3rad/s2", 0.5, 1.3), ("model.p:bias=3rad/s2", 0.5, 1.3), ("rotor.2:thrust=0.85", 0.4, 0.8)):
         found = seen(chain_of(flight(word, mission=mission, end=3.0)))
-        assert least < found["J22"] < most, (word, found)  # a moment turns, then it pushes, then it sinks
-        assert found["J21"] < found["J22"] < found.get("J23", 9.0), (word, found)
+        assert least < found["J22"] < most, (word, found)  # turned, it is pushed, and then it sinks
+        assert found["J22"] < found.get("J23", 9.0), (word, found)
     found = seen(chain_of(flight("model.q:bias=1.5rad/s2", mission=mission, end=3.0)))
     assert found["J21"] < 0.91 and found["J21"] < found.get("J22", 9.0), found
 
