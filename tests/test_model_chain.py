@@ -284,8 +284,18 @@ def test_signatures_and_their_order(mission: str) -> None:
         found = seen(chain_of(flight(word, mission=mission, end=3.0)))
         assert least < found["J22"] < most, (word, found)  # turned, it is pushed, and then it sinks
         assert found["J22"] < found.get("J23", 9.0), (word, found)
-    found = seen(chain_of(flight("model.q:bias=1.5rad/s2", mission=mission, end=3.0)))
-    assert found["J21"] < 0.91 and found["J21"] < found.get("J22", 9.0), found
+    runs = []
+    for k in range(8):  # a yawing moment shows sooner or later by the phase of the mission: the table's delays are means
+        at = AT + 0.93 * k
+        log = simulate(
+            Scenario(
+                mission=mission, duration=at + 3.0, seed=66001 + k, landing=False, fault=(f"model.q:bias=1.5rad/s2@{at:g}",),
+                sensors={"rotors": {"rate": 250.0}}, scale=0.55 if mission == "lissajous" else 1.0,
+            )
+        )  # fmt: skip
+        runs.append({name: delay + AT - at for name, delay in seen(chain_of(log)).items()})
+    assert np.mean([r["J21"] for r in runs]) < 0.91, runs
+    assert all(r["J21"] < r.get("J22", 9.0) for r in runs), runs
 
 
 def test_innovations_are_white_and_of_the_stated_size_and_gusts_alarm_nobody() -> None:
