@@ -1,4 +1,4 @@
-"""Two faults of different parts in one flight, the second 15 s after the first: is each named as it is alone?
+"""Two faults of different parts in one flight, the second 15 s after the first, and whether each is named as it is alone.
 
 ``python docs/_fault_pairs.py --seeds 62000 62004 --runs pairs.jsonl --out docs/_data/fault_pairs.json`` flies them; vehicle file, missions
 and sizes are those of `docs/_truth_table.py`. The first lasts. Pairs of sensors are flown in still air and in gusts, those with a fault of

@@ -62,8 +62,9 @@ STILL, STILL_FOR, BEYOND_GUSTS = 1.5, 15.0, 4.0
 #: Vertical gusts beside horizontal ones; drag by wind that an unknown one may have [1/s].
 DOWN, TYPICAL_DRAG = 0.5, 0.3
 #: What must speak against an accelerometer's fault of the size, in twice the log likelihood: that one of size² D = d would do so by chance
-#: has the probability Φ(-(d + 16)/(2 √d)), at most that of four sigma. An onset of the bank is one of the pair if so near [s].
-AGAINST, NEAR = 16.0, 0.5
+#: has the probability Φ(-(d + 16)/(2 √d)), at most that of four sigma. Along z, where it hears
+#: height too, its innovations are not as white. An onset of the bank is one of the pair if so near [s].
+AGAINST, AGAINST_Z, NEAR = 16.0, 36.0, 0.5
 #: How long forces are not listened to [s]: after a verdict, after a change of the wind, and where there was nothing.
 DEAF, SOON, BRIEFLY = 5.0, 1.5, 0.5
 #: A fault is over when the change is its reverse within this part.
@@ -394,7 +395,7 @@ def silent(s: Any, prm: Any, a: int, size: float) -> int:
         j = (ACCEL + a) * SLOTS + k
         if b.num[j] * b.num[j] > prm.diagnosis_threshold * max(b.den[j], 1e-9):
             return -1
-        if 2.0 * size * b.num[j] - size * size * b.den[j] > -AGAINST:
+        if 2.0 * size * b.num[j] - size * size * b.den[j] > -(AGAINST_Z if a == T else AGAINST):
             return 0
     return 1
 
