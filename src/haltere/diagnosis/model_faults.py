@@ -69,9 +69,9 @@ STILL, STILL_FOR, BEYOND_GUSTS = 1.5, 15.0, 4.0
 #: Vertical gusts beside horizontal ones; drag by wind that an unknown one may have [1/s].
 DOWN, TYPICAL_DRAG = 0.5, 0.3
 #: What must speak against an accelerometer's fault of the size, in twice the log likelihood: that one of size² D = d would do so by chance
-#: has the probability Φ(-(d + 16)/(2 √d)), at most that of four sigma; by what part the size may be off: a few blocks have told it. An onset
-#: of the bank is one of the pair if so near [s].
-AGAINST, ABOUT, NEAR = 16.0, 0.3, 0.5
+#: has the probability Φ(-(d + 16)/(2 √d)), at most that of four sigma; along z, where it hears height too, its innovations are not as white.
+#: By what part the size may be off: a few blocks have told it. An onset of the bank is one of the pair if so near [s].
+AGAINST, AGAINST_Z, ABOUT, NEAR = 16.0, 36.0, 0.3, 0.5
 #: How long forces are not listened to [s]: after a verdict, after a change of the wind, and where there was nothing.
 DEAF, SOON, BRIEFLY = 5.0, 1.5, 0.5
 #: A fault is over when the change is its reverse within this part.
@@ -420,7 +420,7 @@ def silent(s: Any, prm: Any, a: int, size: float) -> int:
             return -1
         likely = b.num[j] / max(b.den[j], 1e-9) * math.copysign(1.0, size)
         likely = math.copysign(min(max(likely, (1.0 - ABOUT) * abs(size)), (1.0 + ABOUT) * abs(size)), size)
-        if 2.0 * likely * b.num[j] - likely * likely * b.den[j] > -AGAINST:
+        if 2.0 * likely * b.num[j] - likely * likely * b.den[j] > -(AGAINST_Z if a == T else AGAINST):
             return 0
     return 1
 

@@ -32,6 +32,7 @@ __all__ = [
     "hinted",
     "listen",
     "restart",
+    "sector",
     "shift_bias",
     "vouch",
     "would_show",
@@ -58,7 +59,7 @@ MOST_RHO, MOST_GAIN = 0.9, 0.95
 #: As in `haltere.diagnosis.inertial`: over how many usual ones a threshold is, stretch [s], how fast that is learnt, its bound.
 BEYOND_USUAL, STRETCH, RISE, FALL, CAP = 2.0, 10.0, 0.6, 0.1, 2.0
 #: Part of its threshold at which a force is looked at: what is made of it has a test of its own (`haltere.diagnosis.model_faults`).
-LOOK = 0.4
+LOOK = 0.5
 #: What is left of the largest moment of late, a block.
 HARD_FOR = 0.98
 #: Forces are compared in the wind of so long ago [s].
@@ -147,7 +148,7 @@ def use_bias(s: Any) -> None:
 def restart(s: Any) -> None:
     """Forget chains and alarms: on the ground, without rotor speeds, after alignment."""
     p = s.pairs[0]
-    p.t_across, p.t_deaf = -1e9, -1e9
+    p.t_across, p.t_deaf, p.headings = -1e9, -1e9, 0
     forget_means(p)
     p.n, p.span, p.t_first, p.t_bias, p.stir, p.calm, p.n_stir, p.n_blocks, p.trial = 0.0, 0.0, 0.0, -1e9, 1.0, 1.0, 0.0, 0, 0
     p.hard = 0.0
@@ -353,6 +354,12 @@ def yaw(s: Any) -> float:
 
 
 @jit
+def sector(heading: float) -> int:
+    """Which of eight sectors a heading is in."""
+    return math.floor((heading + math.pi) / (0.25 * math.pi)) % 8
+
+
+@jit
 def remember(s: Any, prm: Any) -> None:
     """Mark the past: what the chains are now."""
     p = s.pairs[0]
@@ -366,6 +373,7 @@ def remember(s: Any, prm: Any) -> None:
         p.m_turn[k, i] = p.turn[i]
     W = wind_n(s)
     p.m_wind[k, 0], p.m_wind[k, 1], p.m_yaw[k] = W[0], W[1], yaw(s)
+    p.headings |= 1 << sector(p.m_yaw[k])
     p.lag = mark_before(p, s.t - LAG)
     if p.lag >= 0 and p.m_t[p.lag] < p.t_across:  # levels begin anew with a verdict: in the wind of then
         p.lag = -1

@@ -17,7 +17,7 @@ from typing import Any
 from haltere._jit import constant, jit
 from haltere.core.rotation import Vec, dcm, tmat_vec
 from haltere.diagnosis.drifts import LASTS, lasting, walk_of
-from haltere.diagnosis.pairs import yaw
+from haltere.diagnosis.pairs import sector, yaw
 from haltere.vehicle.linear import linear
 
 __all__ = ["WIND", "best", "by_chance", "follow", "start"]
@@ -69,14 +69,14 @@ def by_old_wind(s: Any, i: int) -> float:
 
 @jit
 def turn(s: Any) -> float:
-    """Take the heading; by how much the square of the largest turn since the mark has grown [rad^2]."""
-    p = s.pairs[0]
-    change = yaw(s) - p.heading
+    """Take the heading; by how much the square of the largest turn since the mark has grown [rad^2], to where it has not headed before."""
+    p, now = s.pairs[0], yaw(s)
+    change = now - p.heading
     turned = min(abs(math.atan2(math.sin(change), math.cos(change))), 1.5)
     before = p.turned
     p.turned = max(p.turned, turned)
     p.moved = max(p.moved, math.sqrt(s.v[0] * s.v[0] + s.v[1] * s.v[1]) / FAST, turned / TURNED)
-    return float(p.turned * p.turned - before * before)
+    return 0.0 if (p.headings >> sector(now)) & 1 == 1 else float(p.turned * p.turned - before * before)
 
 
 @jit

@@ -67,7 +67,7 @@ def pairs() -> np.dtype[np.void]:
                 ("P", "f8", (6, 3)),
                 ("sd", "f8", 6),
                 ("scale", "f8", 6),  # noise of the model in this flight over that of the vehicle file, in variances
-                # what forces are off by for a second: sum of residuals, their number, mean before and whether there is one, squares, how many
+                # what forces are off by for a second: sum of residuals, number, mean before and whether there is one, squares, how many
                 ("slow_sum", "f8", 3),
                 ("slow_n", "f8"),
                 ("slow_mean", "f8", 3),
@@ -157,6 +157,7 @@ def pairs() -> np.dtype[np.void]:
                 ("m_var", "f8", (int(MARKS), 6)),
                 ("m_wind", "f8", (int(MARKS), 2)),
                 ("m_yaw", "f8", int(MARKS)),
+                ("headings", "i8"),  # sectors of 45 degrees that it has headed to in the air, a bit each
             ],
         ),
         align=True,
