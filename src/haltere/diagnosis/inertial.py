@@ -61,8 +61,8 @@ SUDDEN = 0.5
 LASTS = 1.2
 #: By how much a name must exceed the others; and for an axis of the gyro against that of the accelerometer which looks most like it.
 MARGIN, MARGIN_ALIKE = 9.0, 16.0
-#: What it says for an axis that the raw samples show its step, or the rotors do; margins as a part of the statistic, since responses are linear and
-#: onsets on a grid.
+#: What it says for an axis that the raw samples show its step, or the rotors do; margins as a part of the statistic, since responses are
+#: linear and onsets on a grid.
 SHOWN, LINEAR = 25.0, 0.02
 #: Part of a threshold that is enough where rotors alarmed by themselves for the same axis, sign and onset: both would have to be wrong.
 TWO_WITNESSES = 0.6
