@@ -69,7 +69,7 @@ STILL, STILL_FOR, BEYOND_GUSTS = 1.5, 15.0, 4.0
 #: Vertical gusts beside horizontal ones; drag by wind that an unknown one may have [1/s].
 DOWN, TYPICAL_DRAG = 0.5, 0.3
 #: What must speak against an accelerometer's fault of the size, in twice the log likelihood: that one of size² D = d would do so by chance
-#: has the probability Φ(-(d + 16)/(2 √d)), at most that of four sigma; along z, where it hears height too, its innovations are not as white.
+#: has the probability Φ(-(d + 16)/(2 √d)), at most that of four sigma; along z, where it hears height too, its innovations are less white.
 #: By what part the size may be off: a few blocks have told it. An onset of the bank is one of the pair if so near [s].
 AGAINST, AGAINST_Z, ABOUT, NEAR = 16.0, 36.0, 0.3, 0.5
 #: How long forces are not listened to [s]: after a verdict, after a change of the wind, and where there was nothing.
