@@ -37,7 +37,7 @@ def listen(x: FloatArray, dt: float = DT, unit: float = 1.0) -> list[tuple[float
         before = int(h["verdict"])
         jumps.listen(h, t, LEVEL, jumps.LASTS)
         if int(h["verdict"]) == 1 and before != 1:
-            found.append((float(h["t_alarm"]), float(h["onset"]), float(h["size"])))
+            found.append((float(h["t_alarm"]), float(h["onset"]), float(h["found"])))
     return found
 
 

@@ -81,7 +81,7 @@ def compass_that_steps(s: Any, prm: Any) -> None:
         return
     k, rate = compass.moment(s, h.onset)
     limit = compass.allowed(s, prm) + prm.robust_calibration * rate * TURN / math.cos(s.field[1])
-    seen, onset, size = h.t_alarm, h.onset, h.size
+    seen, onset, size = h.t_alarm, h.onset, h.found
     h.t_free = s.t + NO_STEP_FOR
     jumping.restart(h)
     if abs(size) < limit or prm.aid_compass_watch == 0.0:
@@ -154,7 +154,7 @@ def settle(h: Any, lasts: float) -> None:
     stands = after / m - before / n
     sure = stands * stands > SURE * SURE * (h.r * (1.0 / n + 1.0 / m) + h.q * lasts)
     if sure and stands * size > STANDS * size * size:
-        h.verdict, h.size, h.onset = STEP, size, when
+        h.verdict, h.found, h.onset = STEP, size, when
 
 
 @jit

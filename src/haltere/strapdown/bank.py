@@ -117,7 +117,7 @@ _JUMP = _record(
     ("t_usual", "f8"),
     ("t_alarm", "f8"),  # of what is looked into (0: nothing): when it alarmed, 1 a step, -1 none, its size and onset
     ("verdict", "i8"),
-    ("size", "f8"),
+    ("found", "f8"),
     ("onset", "f8"),
     ("t_free", "f8"),  # nothing alarms before
 )
