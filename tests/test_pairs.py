@@ -64,11 +64,6 @@ def test_an_accelerometer_is_not_taken_for_the_model(identified: Vehicle, size: 
     assert e["candidates"] == ["accel.z"]
 
 
-def test_small_forces_are_found_in_still_air(identified: Vehicle) -> None:
-    (e,) = told(identified, f"model.t:bias=0.4m/s2@{AT:g}", "hover")
-    assert e["candidates"] == ["model.t"] and e["t_isolated"] is not None
-
-
 def test_in_hover_a_force_along_an_axis_and_a_wind_along_it_are_both_named(identified: Vehicle) -> None:
     for word in (f"model.hx:bias=0.8m/s2@{AT:g}", f"wind.n:step=2m/s@{AT:g}"):
         (e,) = told(identified, word, "hover")
