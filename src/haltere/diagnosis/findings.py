@@ -67,7 +67,7 @@ def findings(kind: str, record: np.void, events: list[dict[str, Any]]) -> None:
     }  # fmt: skip
     told = next((e for e in reversed(events) if _suspected(e) and set(candidates) & set(e["candidates"])), None)
     if isolated and told is not None and out["t_isolated"] - told["t_detected"] < REVISED:
-        out["t_detected"] = told["t_detected"]
+        out["t_detected"], out["t_onset"] = told["t_detected"], min(out["t_onset"], told["t_detected"])
         events[events.index(told)] = out
     else:
         events.append(out)

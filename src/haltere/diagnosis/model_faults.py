@@ -86,6 +86,8 @@ AROUND, OFF_CENTRE = 0.1, 0.6
 AS_GUSTS, PART = 1.5, 0.6
 #: What the model of a moment is off by as a part of the largest of late: constants, and the time of a rotor's speed.
 HARD = 0.05
+#: How many sigma of it a moment of the model alone must be.
+SURE = 2.0
 UP, FORCES, T, R, P, Q = (constant(i) for i in (1, 3, 2, 3, 4, 5))
 
 
@@ -376,7 +378,7 @@ def of_moments(s: Any, prm: Any) -> bool:
         lift(s, first, thrust, m_q, s_q)
         return True
     size, sd = lately(s, axis), s_r if axis == R else (s_p if axis == P else s_q)
-    if abs(size) > least_moment:
+    if abs(size) > max(least_moment, SURE * sd):  # what the vehicle file says the model is off by is no fault
         conclude(s, axis, MODEL + axis, size, sd, UP << axis, E_FAULT)
         return True
     return bool(s.t >= p.onset + UNDECIDED)
