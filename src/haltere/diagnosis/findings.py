@@ -61,8 +61,9 @@ def findings(kind: str, record: np.void, events: list[dict[str, Any]]) -> None:
     else:
         evidence += f"; so may {' or '.join(c for c in candidates if c != FAMILIES[family])}"
     out = {
-        "sensor": sensor, "axis": axis or None, "kind": fault, "t_onset": float(record["onset"]), "t_detected": float(record["seen"]),
-        "t_isolated": float(record["t"]) if isolated else None, "t_recovered": None, "candidates": candidates,
+        "sensor": sensor, "axis": axis or None, "kind": fault, "t_onset": min(float(record["onset"]), float(record["seen"])),
+        "t_detected": float(record["seen"]), "t_isolated": float(record["t"]) if isolated else None, "t_recovered": None,
+        "candidates": candidates,
         "statistic": float(record["value"]), "threshold": float(record["threshold"]), "evidence": evidence,
     }  # fmt: skip
     told = next((e for e in reversed(events) if _suspected(e) and set(candidates) & set(e["candidates"])), None)
