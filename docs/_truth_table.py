@@ -242,8 +242,9 @@ def page(result: Mapping[str, Any]) -> str:
         cells = [f"`{r['word']}`", r["mission"], r["wind"], f"{r['good']} of {r['n']}", seen, str(r["named_median"] or "–"), told]
         lines.append("| " + " | ".join(cells) + " |")
     q = result["quiet"]
-    words = f"{len(q['alarms'])} alarms in {q['hours']:.1f} h without a fault (half in gusts): "
-    lines += ["", f"{words}{q['interval'][0]:.2f} to {q['interval'][1]:.2f} an hour with 95 %."]
+    if q["flights"]:
+        words = f"{len(q['alarms'])} alarms in {q['hours']:.1f} h without a fault (half in gusts): "
+        lines += ["", f"{words}{q['interval'][0]:.2f} to {q['interval'][1]:.2f} an hour with 95 %."]
     lines += ["", f"Seeds {result['seeds'][0]} to {result['seeds'][1]}, IMU at 250 Hz, commit {', '.join(result['commits'])}."]
     return "\n".join(lines)
 
