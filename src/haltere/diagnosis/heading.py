@@ -12,7 +12,7 @@ from typing import Any
 from haltere._jit import jit
 from haltere.aids import compass
 from haltere.aids.record import E_FAULT, NO_SENSOR, event_since
-from haltere.diagnosis.steps import shown
+from haltere.diagnosis.steps import LARGE, extreme, shown
 from haltere.filter.signatures import GYRO, SLOTS
 
 __all__ = ["gyro_that_turns"]
@@ -39,6 +39,9 @@ def gyro_that_turns(s: Any) -> int:
     if first:
         b.t_turn, b.turn_rate, b.turn_lasted = c.onset, rate, lasted
     step = first and shown(b, 2, -rate, c.onset - 0.6, c.onset + 0.4)
+    if step:  # a larger one was looked at by itself, and is the vehicle's
+        z, _ = extreme(b.step, 2, -rate, c.onset - 0.6, c.onset + 0.4)
+        step = z < LARGE + 2.0
     on = lasted > LONGER * b.turn_lasted and abs(c.last - c.level) > FAR and abs(rate) > SLOWEST
     if not step and not (on and abs(rate - b.turn_rate) < SAME * abs(rate)):
         return -1

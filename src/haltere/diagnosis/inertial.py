@@ -67,6 +67,8 @@ MARGIN, MARGIN_ALIKE = 9.0, 16.0
 SHOWN, LINEAR = 25.0, 0.02
 #: Part of a threshold that is enough where rotors alarmed by themselves for the same axis, sign and onset: both would have to be wrong.
 TWO_WITNESSES = 0.6
+#: Part of the threshold that an axis of the IMU that tilts must come to without the compass.
+UNAIDED = 0.5
 #: How sure [sigma] it must be that a fault is more than such a change before it is told.
 CERTAIN = 3.0
 #: Changes that are no fault: slopes, as those of a bias over so long [s]; GNSS velocity [m/s], position [m], heading [rad], height [m].
@@ -347,6 +349,13 @@ def weigh(s: Any, prm: Any) -> tuple[int, float]:
 
 
 @jit
+def without_compass(b: Any, prm: Any, j: int) -> bool:
+    """Whether what is not heading speaks for column ``j``, too: a compass that is not calibrated tells of tilts that are not there."""
+    num, den = b.num[j] - b.heading_num[j], b.den[j] - b.heading_den[j]
+    return bool(num * b.num[j] > 0.0 and num * num > UNAIDED * prm.diagnosis_threshold * den)
+
+
+@jit
 def alike(g: int, o: int) -> bool:
     """Whether two axes look alike in hover: gyro x and accelerometer y, gyro y and accelerometer x; tilted into a wind, gyro z and both."""
     low, high = min(g, o), max(g, o)
@@ -385,6 +394,8 @@ def judge(s: Any, prm: Any) -> bool:
     if not doubt.may_name(b, lead, s.t) or not doubt.judged(s) or not doubt.fits(s, b.fault[lead] * SLOTS + k, k):
         return False  # what is wrong is in no list
     if lead < F_VELOCITY and (outside(s, b.onset[k]) or not changed(s, prm, b.fault[lead], k)):
+        return False
+    if lead < F_VELOCITY and lead != VERTICAL and not without_compass(b, prm, b.fault[lead] * SLOTS + k):
         return False
     candidates, others = 1 << lead, 0
     top = b.level[lead]

@@ -38,6 +38,8 @@ AROUND = math.radians(0.1)
 #: Length of the means that are to be white [s], how late they are taken, so that a fault does not hide itself, the most that one counts,
 #: how fast and how far they move the share of the compass' own turning.
 BLOCK, LATE, MOST, FASTER, LEAST_SHARE, MOST_SHARE = 1.0, constant(8), 6.0, 0.1, 0.02, 100.0
+#: Share at first: a compass is not believed before it has shown what it is; until this many means it is learnt faster.
+AT_FIRST, NEW, SOONER = 4.0, constant(24), 0.3
 #: A whitened one counts up to so many sigma, more by this factor of the one before; columns worked on together.
 ALONE, FOLLOWED, WIDTH = 4.0, 1.2, 60
 
@@ -87,7 +89,7 @@ def suppose(
         k.w[i] += part * (w[i] - about * down[i] - k.w[i])
         turned += k.w[i] * k.w[i]
     turned *= 2.0 * TOGETHER
-    share = k.share if k.share > 0.0 else 1.0
+    share = k.share if k.share > 0.0 else AT_FIRST
     k.q += (gyro * gyro + scale * scale * turned + share * (AROUND * AROUND + calibration * calibration * turned)) * dt
     k.q_drift += drift * drift * dt
 
@@ -122,7 +124,7 @@ def begin(b: Any, t: float, y: float) -> None:
     """Take the first sample for the offset."""
     k = b.track
     if k.r == 0.0:
-        k.r, k.share = UNKNOWN, 1.0
+        k.r, k.share = UNKNOWN, AT_FIRST
     k.t, k.o, k.d, k.y, k.n = t, y, 0.0, y, 1
     k.oo, k.od, k.dd, k.last, k.q, k.q_drift = k.r, 0.0, max(DRIFT * DRIFT, k.unsure), 0.0, 0.0, 0.0
     k.total, k.samples, k.t_block = 0.0, 0.0, t
@@ -148,7 +150,8 @@ def adapt(k: Any, t: float, z: float) -> None:
         return
     i = k.blocks % LATE
     if k.blocks >= LATE:
-        k.share = min(max(k.share * math.exp(FASTER * (min(k.late[i], MOST) - 1.0)), LEAST_SHARE), MOST_SHARE)
+        faster = SOONER if k.blocks < NEW else FASTER
+        k.share = min(max(k.share * math.exp(faster * (min(k.late[i], MOST) - 1.0)), LEAST_SHARE), MOST_SHARE)
     k.late[i] = k.total * k.total / k.samples
     k.blocks += 1
     k.total, k.samples, k.t_block = 0.0, 0.0, t
