@@ -62,7 +62,7 @@ lint: $(VENV)/.lint
 	$(BIN)/lint-imports --no-logo
 
 docs: $(VENV)/.docs
-	$(BIN)/python -m sphinx -W --keep-going -q -b html docs docs/_build/html
+	$(BIN)/python -m sphinx -W --keep-going -q -j auto -b html docs docs/_build/html
 
 clean:
 	rm -rf build dist docs/_build docs/jupyter_execute benchmarks/build demo.haltere
