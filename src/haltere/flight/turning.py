@@ -35,8 +35,8 @@ STRENGTH = 0.15
 #: Factors from the gyro's unit to rad/s: none; deg/s; rad/s taken for deg/s and converted; mrad/s.
 FACTORS = (1.0, math.pi / 180.0, 180.0 / math.pi, 1e-3)
 #: Explained shares: rates as given, below which they are in doubt; other ones, above which they are found, and which must leave this many
-#: times less unexplained. On recordings whose axes are right no other reading ever explained more than the rates as given. Wrong axes are
-#: wrong in both halves of what the field turned by; a gyro that fails in flight is not.
+#: times less unexplained, in both halves of what the field turned by too: wrong axes are wrong all the time, a gyro that fails in flight
+#: is not. On recordings whose axes are right no other reading ever explained more than the rates as given.
 DOUBT, FOUND, TIMES = 0.6, 0.7, 4.0
 _TURNS = np.array([axes.matrix(w) for w in axes.WORDS])
 _MIRRORED = np.linalg.det(_TURNS) < 0.0
@@ -56,7 +56,7 @@ class Turning:
     others
         Axes that explain nearly as much: what the vehicle did not turn about cannot be told apart.
     always
-        In both halves of that turning the rates as given explain little.
+        In both halves of that turning, too, the best leaves far less unexplained than the rates as given.
     turned, windows
         Root of the sum of the squared angles that the field turned by [rad], and in how many windows by more than 0.1 rad.
     """
@@ -82,8 +82,7 @@ class Turning:
     @property
     def disagrees(self) -> bool:
         """The rates as given explain little, and in another unit most, or in other axes, in both halves."""
-        there = self.given < DOUBT and self.best > FOUND and 1.0 - self.given > TIMES * (1.0 - self.best)
-        return there and (self.always or self.factor != 1.0)
+        return self.given < DOUBT and self.best > FOUND and _better(self.best, self.given) and (self.always or self.factor != 1.0)
 
 
 def compare(t: FloatArray, gyro: FloatArray, t_field: FloatArray, field: FloatArray, *, steady: float | None = None) -> Turning | None:
@@ -131,12 +130,17 @@ def compare(t: FloatArray, gyro: FloatArray, t_field: FloatArray, field: FloatAr
     k, j = np.unravel_index(int(np.argmax(shares)), shares.shape)
     best = float(shares[k, j])
     half = int(np.searchsorted(np.cumsum(turned**2), 0.5 * np.sum(turned**2))) + 1
-    parts = [_explained(steps[i], m0[i], change[i])[0, 0] for i in (slice(half), slice(half, None)) if len(turned[i])]
+    parts = [_explained(steps[i], m0[i], change[i]) for i in (slice(half), slice(half, None)) if len(turned[i])]
     near = [w for w, share in zip(axes.WORDS, shares[k], strict=True) if 1.0 - share < 2.0 * (1.0 - best) and w != axes.WORDS[j]]
     return Turning(
-        float(shares[0, 0]), best, axes.WORDS[j], FACTORS[k], tuple(near), max(parts) < DOUBT,
+        float(shares[0, 0]), best, axes.WORDS[j], FACTORS[k], tuple(near), all(_better(part[k, j], part[0, 0]) for part in parts),
         float(np.sqrt(np.sum(turned**2))), int(np.count_nonzero(turned > 0.1)),
     )  # fmt: skip
+
+
+def _better(share: float, given: float) -> bool:
+    """Far less is unexplained."""
+    return bool(1.0 - given > TIMES * (1.0 - share))
 
 
 def _window_ends(t: FloatArray, v: FloatArray) -> tuple[FloatArray, FloatArray]:
