@@ -15,8 +15,10 @@ from typing import Any
 
 from haltere._jit import constant, jit
 from haltere.aids import compass
+from haltere.aids.air import wind_n
 from haltere.aids.compass import OUT_TURN
 from haltere.aids.record import E_FAULT, E_OVER, E_SUSPECT, NO_SENSOR, event_since
+from haltere.core.rotation import dcm, tmat_vec
 from haltere.diagnosis import doubt
 from haltere.diagnosis.drifts import LASTS, forget_means, lasting
 from haltere.diagnosis.model_detectors import testify
@@ -236,8 +238,23 @@ def moment_of(s: Any, i: int) -> tuple[float, float]:
     """Moment that the model lacks since the onset, and its 1 sigma [rad/s^2]."""
     p = s.pairs[0]
     span = max(s.t - p.onset, EARLY)
-    sd2 = 2.0 * p.r[i] / (span * span) + density_of_noise(s, i) / span + offset_variance(s, i) + LEAST_M * LEAST_M
+    air = by_air(s, i, span)
+    sd2 = 2.0 * p.r[i] / (span * span) + density_of_noise(s, i) / span + offset_variance(s, i) + LEAST_M * LEAST_M + air * air
     return change(s, i) / span, math.sqrt(sd2)
+
+
+@jit
+def by_air(s: Any, i: int, span: float) -> float:
+    """What a moment is off by if forces that alarmed are the accelerometer's: they bend the velocity and, as drag, the wind [rad/s^2]."""
+    p, off = s.pairs[0], 0.0
+    if p.t_alarm[0] == 0.0 and p.t_alarm[1] == 0.0 and p.t_alarm[T] == 0.0:
+        return 0.0
+    W = wind_n(s)
+    blown = tmat_vec(dcm((s.q[0], s.q[1], s.q[2], s.q[3])), (W[0] - p.m_wind[p.mark, 0], W[1] - p.m_wind[p.mark, 1], 0.0))
+    for j in range(FORCES):
+        bent = 0.5 * abs(p.told_size[j]) * span if p.t_alarm[j] != 0.0 else 0.0
+        off += abs(p.by_v[1, i - FORCES, j]) * (abs(blown[j]) + bent)
+    return off
 
 
 @jit
