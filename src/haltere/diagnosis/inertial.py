@@ -21,7 +21,7 @@ from haltere.diagnosis.heading import gyro_that_turns
 from haltere.diagnosis.healing import follow, heal, heal_between
 from haltere.diagnosis.model_detectors import BY_BAROMETER, BY_POSITION, BY_VELOCITY, outside, spoke, testify
 from haltere.diagnosis.steps import refuted, shown
-from haltere.filter import jumping, turning
+from haltere.filter import jumping, turning, usual
 from haltere.filter.signatures import (
     ACCEL,
     ACCEL_RAMP,
@@ -82,8 +82,6 @@ GYRO_MOST, ACCEL_MOST = 1.0, 8.0
 GYRO_STEEPEST, ACCEL_STEEPEST = math.radians(0.3), 0.12
 #: Factor on the threshold of what is no inertial sensor: its errors last longer than a filter believes.
 OTHERS = 2.0
-#: The threshold is at least so many times the usual maximum of a block [s]; how fast that is learnt, a part each block; its bound.
-BEYOND_USUAL, BLOCK, RISE, FALL, CAP = 2.0, 10.0, 0.6, 0.1, 2.0
 #: Least information on a size, in 1/(unit)^2.
 LEAST = 1.0
 #: GNSS velocity speaks if it did so long ago [s].
@@ -211,9 +209,7 @@ def tick(s: Any, prm: Any, dt: float) -> bool:
             jumping.restart(b.height)
             jumping.restart(b.course)
             doubt.begin(s)
-            b.t_block = s.t + BLOCK
-            for g in range(N_FAMILIES):
-                b.peak[g], b.waiting[g], b.usual[g] = 0.0, 0.0, 0.0
+            usual.begin(b, s.t)
         b.n_aligned, b.t_slot, b.t_judge = s.n_aligned, s.t, s.t
         for a in range(len(b.slope)):
             b.slope[a] = 0.0
@@ -262,24 +258,6 @@ def said(s: Any, g: int, onset: float) -> float:
 def doubled(s: Any, g: int, onset: float) -> float:
     """Factor on the threshold of what is no inertial sensor; none where the vehicle's model says the same."""
     return 1.0 if g < F_VELOCITY or said(s, g, onset) >= 0.0 else OTHERS
-
-
-@jit
-def usual(b: Any, g: int) -> float:
-    """Factor on the threshold of a family from what its statistic has come to in this flight: innovations are not white."""
-    return max(1.0, BEYOND_USUAL * b.usual[g])
-
-
-@jit
-def learn_usual(b: Any, t: float) -> None:
-    """At the end of a block, take its maxima into what is usual, one block late: a fault shall not raise its own threshold."""
-    if t < b.t_block:
-        return
-    b.t_block = t + BLOCK
-    for g in range(N_FAMILIES):
-        b.usual[g] += (RISE if b.waiting[g] > b.usual[g] else FALL) * (b.waiting[g] - b.usual[g])
-        b.waiting[g] = min(b.peak[g], CAP)
-        b.peak[g] = 0.0
 
 
 @jit
@@ -343,7 +321,7 @@ def weigh(s: Any, prm: Any) -> tuple[int, float]:
         if b.level[g] > b.level[lead]:
             lead = g
         b.peak[g] = max(b.peak[g], b.beyond[g])
-        b.beyond[g] /= usual(b, g)
+        b.beyond[g] /= usual.raised(b, g)
         ratio = max(ratio, b.beyond[g])
     return lead, ratio
 
@@ -378,7 +356,7 @@ def in_samples(s: Any, g: int) -> bool:
 def judge(s: Any, prm: Any) -> bool:
     """Alarm, set or name from the bank as it stands; True when the state was changed."""
     b = s.bank[0]
-    learn_usual(b, s.t)
+    usual.learn(b, s.t)
     lead, ratio = weigh(s, prm)
     if b.beyond[lead] < 1.0:  # what explains most is no fault
         if b.alarm != 0 and ratio < 0.5:
@@ -424,7 +402,7 @@ def tell(s: Any, prm: Any, code: Any, g: int, candidates: int) -> None:
     f, k = b.fault[g], b.slot[g]
     j = f * SLOTS + k
     n = s.n_events
-    threshold = prm.diagnosis_threshold * doubled(s, g, b.onset[k]) * usual(b, g)
+    threshold = prm.diagnosis_threshold * doubled(s, g, b.onset[k]) * usual.raised(b, g)
     event_since(s, s.t, b.onset[k], code, NO_SENSOR, b.level[g], threshold, f)
     if s.n_events > n:
         e = s.event[n]

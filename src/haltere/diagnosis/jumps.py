@@ -14,7 +14,7 @@ from typing import Any
 from haltere._jit import constant, jit
 from haltere.aids import compass
 from haltere.diagnosis import doubt
-from haltere.filter import jumping
+from haltere.filter import jumping, usual
 from haltere.filter.jumping import JUMP_RING
 
 __all__ = ["LASTS", "compass_that_steps", "listen", "settled", "step_or_rise", "stepped"]
@@ -33,8 +33,6 @@ BETTER = 4.0
 STANDS, SURE = 0.6, 4.0
 #: An onset of the bank is on a grid; one of the same step is this near [s].
 SAME = 0.3
-#: The threshold is at least so many times what is usual; stretch [s], how fast that is learnt, its bound.
-BEYOND_USUAL, STRETCH, RISE, FALL, CAP = 2.0, 10.0, 0.6, 0.1, 2.0
 STEP, NO_STEP = constant(1), constant(-1)
 #: A compass' calibration shows over a turn of so long [s] at the most, in what looks like a step.
 TURN = 0.1
@@ -54,16 +52,12 @@ def listen(h: Any, t: float, threshold: float, lasts: float) -> None:
             jumping.restart(h)
         return
     over = h.glr / threshold
-    h.peak = max(h.peak, over)
-    if over > max(1.0, BEYOND_USUAL * h.usual) and t >= h.t_free:
+    h.peak[0] = max(h.peak[0], over)
+    if over > usual.raised(h, 0) and t >= h.t_free:
         h.t_alarm, h.verdict = t, 0
         h.onset = h.t[(h.filled - min(h.w.window, JUMP_RING)) % JUMP_RING]
         return
-    if t >= h.t_usual:
-        h.t_usual = t + STRETCH
-        h.usual += (RISE if h.waiting > h.usual else FALL) * (h.waiting - h.usual)
-        h.waiting = min(h.peak, CAP)
-        h.peak = 0.0
+    usual.learn(h, t)
 
 
 @jit

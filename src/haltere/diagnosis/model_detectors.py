@@ -21,6 +21,7 @@ from haltere.aids.record import BAROMETER, E_ALARM, GNSS_VELOCITY, MAGNETOMETER,
 from haltere.core.rotation import Mat, Vec, cross, dcm, mat_vec, quat_from_rotvec, quat_mul, quat_unit, sub, wrap
 from haltere.diagnosis import doubt
 from haltere.diagnosis.model_chain import advance, forget_chain, gather, listen, lost, seed
+from haltere.filter import usual
 from haltere.filter.update import NONE, apply, column_of, innovation, project, variance
 from haltere.filter.windows import empty, take
 from haltere.strapdown.dynamics import ATTITUDE, MEAN, PLACE, SPEED
@@ -51,8 +52,6 @@ SETTLE, AIRBORNE = 4.0, 5.0
 LEARN, EARLY, LONE, MOST_RHO = 400.0, 40.0, 9.0, 0.9
 #: Bounds of what innovations come to, mean square over what the chain expects; and of a sensor's variance, over what is configured.
 LEAST, MOST, LEAST_WORTH = 0.05, 9.0, 0.01
-#: As in `haltere.diagnosis.pairs`: over how many usual ones a threshold is, stretch [s], how fast that is learnt, its bound.
-BEYOND_USUAL, STRETCH, RISE, FALL, CAP = 2.0, 10.0, 0.6, 0.1, 2.0
 #: An alarm is over when its statistic was not above the threshold for so long [s]; the chain begins anew after one of so long [s].
 OVER, PATIENCE = 3.0, 10.0
 #: A compass that is put out is compared for so long [s].
@@ -66,10 +65,10 @@ def forget(s: Any) -> None:
     """There is no chain, and nothing is known of its innovations: after alignment."""
     forget_chain(s)
     c = s.chain[0]
-    c.t_usual = s.t + STRETCH
+    usual.begin(c, s.t)
     for k in range(CHAIN_DETECTORS):
         c.c0[k], c.c1[k], c.n_learnt[k], c.worth[k] = 1.0, 0.0, 0.0, 1.0
-        c.peak[k], c.waiting[k], c.usual[k], c.t_alarm[k], c.t_over[k] = 0.0, 0.0, 0.0, -1e9, -1e9
+        c.t_alarm[k], c.t_over[k] = -1e9, -1e9
 
 
 @jit
@@ -122,7 +121,7 @@ def drive(s: Any, prm: Any, dt: float) -> None:
         forget_chain(s)  # begins anew with the next sample
         return
     hear(s, prm)
-    learn_usual(c, s.t)
+    usual.learn(c, s.t)
 
 
 @jit
@@ -304,23 +303,11 @@ def judge(s: Any, prm: Any, k: int, z: Vec, d: int) -> None:
     if not armed(s):
         return
     c.peak[k] = max(c.peak[k], over)
-    if over > max(1.0, BEYOND_USUAL * c.usual[k]):
+    if over > usual.raised(c, k):
         if s.t - c.t_over[k] > OVER:
             c.t_alarm[k] = s.t
             event_since(s, s.t, s.t, E_ALARM, NO_SENSOR, glr, level, ALARM + k)
         c.t_over[k] = s.t
-
-
-@jit
-def learn_usual(c: Any, t: float) -> None:
-    """At the end of a stretch, take its maxima into what is usual, one stretch late: a fault shall not raise its own threshold."""
-    if t < c.t_usual:
-        return
-    c.t_usual = t + STRETCH
-    for k in range(CHAIN_DETECTORS):
-        c.usual[k] += (RISE if c.waiting[k] > c.usual[k] else FALL) * (c.waiting[k] - c.usual[k])
-        c.waiting[k] = min(c.peak[k], CAP)
-        c.peak[k] = 0.0
 
 
 @jit

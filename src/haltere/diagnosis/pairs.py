@@ -17,6 +17,7 @@ from haltere.aids.air import wind_n
 from haltere.core.rotation import Vec, dcm, tmat_vec
 from haltere.diagnosis.drifts import LASTS, MEAN, forget_means, lasting, shift_means, take_means, walk_of
 from haltere.diagnosis.stand_in import across, density_of_noise, mark_before, offset_variance
+from haltere.filter import usual
 from haltere.filter.windows import empty, take
 from haltere.strapdown.pairs import LATELY, MARKS, MATCHED
 from haltere.strapdown.propagate import gusts
@@ -56,8 +57,6 @@ QUICK, SETTLED, LEAST_SCALE, MOST_SCALE = 0.2, 0.02, 0.01, 4.0
 STEPS_TOO = 1.5
 #: Most correlation of neighbours that is taken out; most of a step that a chain follows a block.
 MOST_RHO, MOST_GAIN = 0.9, 0.95
-#: As in `haltere.diagnosis.inertial`: over how many usual ones a threshold is, stretch [s], how fast that is learnt, its bound.
-BEYOND_USUAL, STRETCH, RISE, FALL, CAP = 2.0, 10.0, 0.6, 0.1, 2.0
 #: Part of its threshold at which a force is looked at: what is made of it has a test of its own (`haltere.diagnosis.model_faults`).
 LOOK = 0.5
 #: What is left of the largest moment of late, a block.
@@ -296,7 +295,7 @@ def listen(s: Any, prm: Any) -> bool:
             continue
         if deaf:
             continue
-        factor = max(1.0, BEYOND_USUAL * p.usual[i])
+        factor = usual.raised(p, i)
         if over > factor and enough and (p.t_alarm[i] == 0.0 or p.t_hint[i] < p.t_alarm[i]):
             p.t_hint[i], p.hint_sign[i] = s.t, sign  # a witness is one at its full threshold only
         factor *= LOOK if i < FORCES else 1.0
@@ -319,12 +318,7 @@ def listen(s: Any, prm: Any) -> bool:
         p.lately[k, i] = p.residual[FORCES + i]
     p.t_lately[k] = s.t
     p.n_lately += 1
-    if s.t >= p.t_usual:
-        p.t_usual = s.t + STRETCH
-        for i in range(AXES):
-            p.usual[i] += (RISE if p.waiting[i] > p.usual[i] else FALL) * (p.waiting[i] - p.usual[i])
-            p.waiting[i] = min(p.peak[i], CAP)
-            p.peak[i] = 0.0
+    usual.learn(p, s.t)
     if s.t >= p.t_mark and p.t_first == 0.0 and p.n_blocks > WARM // 2:
         remember(s, prm)
     return p.t_first != 0.0
@@ -407,7 +401,7 @@ def would_show(s: Any, prm: Any, i: int, size: float) -> bool:
     p = s.pairs[0]
     if p.flying == 0 or p.n_blocks < WARM or s.t - p.t_flying < AIRBORNE or p.sd[i] <= 0.0:
         return False
-    root = math.sqrt(prm.diagnosis_pair_threshold * max(1.0, BEYOND_USUAL * p.usual[i])) + POWER
+    root = math.sqrt(prm.diagnosis_pair_threshold * usual.raised(p, i)) + POWER
     if i < FORCES:
         return FOUND * size * size / (p.r[i] * BLOCK + MEAN * lasting(s, i) + p.P[i, 0]) > root * root
     K = p.P[i, 0] / (p.sd[i] * p.sd[i])

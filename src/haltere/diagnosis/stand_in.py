@@ -21,6 +21,7 @@ from haltere.aids.air import air_velocity, core_blocks, quadratic_block, wind_bl
 from haltere.aids.drag import density_ratio
 from haltere.core.earth import STANDARD_DENSITY
 from haltere.core.rotation import Mat, Vec, dcm
+from haltere.filter import usual
 from haltere.filter.update import NONE, project, variance
 from haltere.vehicle.linear import linear
 
@@ -54,9 +55,10 @@ def forget(s: Any) -> None:
     p.standing, p.flying, p.head, p.wrong, p.ground, p.lifted = 0, 0, 0, 0, s.p[2], 0
     for i in range(len(p.lift)):
         p.lift[i], p.torque[i] = 0.0, 0.0
-    p.t_ratio, p.t_mark, p.t_usual = -1e9, -1e9, s.t + 10.0
+    p.t_ratio, p.t_mark = -1e9, -1e9
+    usual.begin(p, s.t)
     for i in range(6):
-        p.on[i], p.usual[i], p.peak[i], p.waiting[i] = 0, 0.0, 0.0, 0.0
+        p.on[i] = 0
     for i in range(3):
         p.turn[i] = 0.0
     k = twist_column(s)

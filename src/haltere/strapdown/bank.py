@@ -111,9 +111,9 @@ _JUMP = _record(
     ("d", "f8", int(JUMP_RING)),  # the last values, and their times
     ("t", "f8", int(JUMP_RING)),
     ("filled", "i8"),
-    ("peak", "f8"),  # statistic over threshold: largest of this stretch and of the one before, what is usual
-    ("waiting", "f8"),
-    ("usual", "f8"),
+    ("peak", "f8", 1),  # statistic over threshold: largest of this stretch and of the one before, what is usual
+    ("waiting", "f8", 1),
+    ("usual", "f8", 1),
     ("t_usual", "f8"),
     ("t_alarm", "f8"),  # of what is looked into (0: nothing): when it alarmed, 1 a step, -1 none, its size and onset
     ("verdict", "i8"),
@@ -162,7 +162,7 @@ def bank(n: int) -> np.dtype[np.void]:
         ("peak", "f8", 14),
         ("waiting", "f8", 14),
         ("usual", "f8", 14),
-        ("t_block", "f8"),
+        ("t_usual", "f8"),
         ("fault", "i8", 14),
         ("slot", "i8", 14),
         ("alarm", "i8"),  # 1: seen, 2: told as a set

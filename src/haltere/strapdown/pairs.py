@@ -55,11 +55,10 @@ def pairs() -> np.dtype[np.void]:
                 ("bias", "f8", 6),
                 ("next", "f8", 6),
                 ("t_bias", "f8"),
-                # block of samples: residual sums, number, when it ends
+                # block of samples: residual sums, number, length
                 ("total", "f8", 6),
                 ("n", "f8"),
                 ("span", "f8"),
-                ("t_block", "f8"),
                 # chain of each pair: of a force its offset and what it is off by for a second beside, of a moment the rate less `turn` and
                 # its drift; covariance
                 ("level", "f8", 6),
