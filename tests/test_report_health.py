@@ -247,6 +247,40 @@ def test_every_finding_has_its_words(demo: Shown, what: str) -> None:
     assert (said.headline != plain.headline) == used
 
 
+def event(sensor: str, axis: str | None, onset: float, kind: str = "bias", *, isolated: bool = True) -> dict[str, Any]:
+    return {
+        "sensor": sensor, "axis": axis, "kind": kind, "t_onset": onset, "t_detected": onset + 0.1, "t_recovered": None,
+        "t_isolated": onset + 1.0 if isolated else None, "candidates": [], "statistic": 50.0, "threshold": 32.0, "evidence": "so",
+    }  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("events", "headline"),
+    [
+        ([event("gyro", "x", 20.0)], "An inertial sensor failed: gyro x, first at t = 20.0 s; its effect was taken back"),
+        ([event("gyro", "x", 20.0), event("gyro", "x", 25.0)], "An inertial sensor failed: gyro x, first at t = 20.0 s; its effect"),
+        (
+            [event("accel", "z", 30.0), event("gyro", "x", 20.0)],
+            "An inertial sensor failed: gyro x and accelerometer z, first at t = 20.0 s",
+        ),
+        ([event("barometer", None, 20.0)], "A fault was found: barometer, from t = 20.0 s."),
+        ([event("gnss", "n", 20.0)], "A fault was found: GNSS north, from t = 20.0 s."),
+        ([event("rotors", "2", 20.0, "thrust")], "A fault was found: rotor 2 or its tachometer, from t = 20.0 s."),
+        ([event("model", "q", 20.0)], "A fault was found: a yawing moment that the vehicle's model lacks, from t = 20.0 s."),
+        (
+            [event("gyro", "x", 35.0), event("barometer", None, 20.0)],
+            "2 faults were found: barometer, from t = 20.0 s; gyro x, from t = 35.0 s; what gyro x did was taken back",
+        ),
+        ([event("model", "hx", 20.0, isolated=False)], "The sensors agree"),
+    ],
+)
+def test_what_failed_is_the_headline(demo: Shown, events: list[dict[str, Any]], headline: str) -> None:
+    solution, flight = demo
+    said = verdict(Context(replace(solution, events=[*solution.events, *events]), flight, Pool()))
+    assert said.headline.startswith(headline)
+    assert said.level == ("doubtful" if headline[0] in "A2" else "good")
+
+
 def test_findings_from_json_without_all_keys_are_told(demo: Shown) -> None:
     solution, flight = demo
     summary = {k: v for k, v in solution.summary.items() if k not in ("findings", "sensors", "whiteness")}

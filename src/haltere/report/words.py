@@ -16,8 +16,8 @@ from haltere.report.context import Context, Episode, sensor_label
 from haltere.report.series import Pool
 
 __all__ = [
-    "Verdict", "count", "diagnosis_in_words", "discarded", "facts", "fixed", "nis_in_words", "number", "verdict", "verdict_of",
-    "whiteness_in_words", "wind_in_words",
+    "Verdict", "count", "diagnosis_in_words", "discarded", "facts", "fixed", "named_faults", "nis_in_words", "number", "verdict",
+    "verdict_of", "whiteness_in_words", "wind_in_words",
 ]  # fmt: skip
 
 #: Share of a stream's samples above which a discard is worth a word in the verdict.
@@ -85,16 +85,14 @@ def verdict(c: Context) -> Verdict:
     ill = list(dict.fromkeys(_unit_label(f) for f in found if base_name(f["stream"]) == f["stream"]))  # further units are not used
     compass = disturbances(solution.events)
     alone = compass and by_level["bad"] == ["magnetometer"] and not by_level["doubtful"] and compass[0]["t_onset"] > solution.t[0] + 2.0
-    failed = [e for e in solution.events if e["sensor"] in ("gyro", "accel") and e["t_isolated"] is not None]
+    failed = named_faults(solution.events)
     driven = [e for e in solution.events if e["sensor"] == "rotors" and e.get("candidates")]
     doubtful = by_level["doubtful"] or lost or drifting or torn or ill or alone or failed
     worst = 2 if (by_level["bad"] and not alone) or broken else 1 if doubtful else 0
     if broken:
         headline = f"The filter broke down {count(len(broken), 'time')}: read what follows with that in mind."
     elif failed:
-        axes = _list(list(dict.fromkeys(f"{sensor_label(e['sensor'])} {e['axis']}" for e in failed)))
-        healed = "its effect was taken back" if len(failed) == 1 else "their effects were taken back"
-        headline = f"An inertial sensor failed: {axes}, first at t = {failed[0]['t_onset']:.1f} s; {healed} as far as it is known."
+        headline = _failed(failed)
     elif driven:
         whose = " or ".join(driven[0]["candidates"])
         headline = f"The vehicle did not do what its rotors should make it do, first at t = {driven[0]['t_onset']:.1f} s: {whose}."
@@ -127,6 +125,48 @@ def verdict(c: Context) -> Verdict:
         out.sentences.append(f"D{diagnosis_in_words(summary)[1:]}.")
     out.sentences += [*_what_happened(c), *_quality(c), *_left_out(summary)]
     return out
+
+
+#: What a force or moment is called that a vehicle's model does not have.
+_OF_THE_MODEL = {
+    "hx": "a force along body x", "hy": "a force along body y", "t": "a force along the thrust axis",
+    "r": "a rolling moment", "p": "a pitching moment", "q": "a yawing moment",
+}  # fmt: skip
+
+
+def named_faults(events: list[dict[str, Any]]) -> list[tuple[float, str]]:
+    """Onset [s] and name of every part that was found to fail, in order of time: a part that failed before is not said again.
+
+    A compass that was disturbed is one of them where something else failed, too: alone it is no fault of the compass.
+    """
+    found: dict[str, float] = {}
+    compass = disturbances(events)
+    for e in sorted((e for e in events if e["t_onset"] is not None), key=lambda e: float(e["t_onset"])):
+        sensor, axis = e["sensor"], e.get("axis")
+        if sensor in ("gyro", "accel", "gnss", "barometer") and e["t_isolated"] is not None:
+            name = f"{'accelerometer' if sensor == 'accel' else sensor_label(sensor)} {_AXES.get(axis, axis) or ''}".strip()
+        elif sensor == "rotors" and e["kind"] == "thrust" and e["t_isolated"] is not None:
+            name = f"rotor {axis} or its tachometer"
+        elif sensor == "model" and e["t_isolated"] is not None:
+            name = f"{_OF_THE_MODEL[axis]} that the vehicle's model lacks"
+        elif sensor == "magnetometer" and e in compass:
+            name = "compass"
+        else:
+            continue
+        found.setdefault(name, float(e["t_onset"]))
+    return [] if list(found) == ["compass"] else [(t, name) for name, t in found.items()]
+
+
+def _failed(found: list[tuple[float, str]]) -> str:
+    """The headline for parts that failed."""
+    inertial = [name for _, name in found if name.startswith(("gyro", "accelerometer"))]
+    healed = f"; {'its effect was' if len(inertial) == 1 else 'their effects were'} taken back as far as it is known" if inertial else ""
+    if len(inertial) == len(found):
+        return f"An inertial sensor failed: {_list(inertial)}, first at t = {found[0][0]:.1f} s{healed}."
+    if inertial:
+        healed = f"; what {_list(inertial)} did was taken back as far as it is known"
+    parts = [f"{name}, from t = {t:.1f} s" for t, name in found]
+    return f"{'A fault was' if len(parts) == 1 else f'{len(parts)} faults were'} found: {'; '.join(parts)}{healed}."
 
 
 def _list(words: list[str]) -> str:
