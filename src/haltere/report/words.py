@@ -142,9 +142,9 @@ def named_faults(events: list[dict[str, Any]]) -> list[tuple[float, str]]:
     found: dict[str, float] = {}
     compass = disturbances(events)
     for e in sorted((e for e in events if e["t_onset"] is not None), key=lambda e: float(e["t_onset"])):
-        sensor, axis = e["sensor"], e.get("axis")
+        sensor, axis = e["sensor"], str(e.get("axis") or "")
         if sensor in ("gyro", "accel", "gnss", "barometer") and e["t_isolated"] is not None:
-            name = f"{'accelerometer' if sensor == 'accel' else sensor_label(sensor)} {_AXES.get(axis, axis) or ''}".strip()
+            name = f"{'accelerometer' if sensor == 'accel' else sensor_label(sensor)} {_AXES.get(axis, axis)}".strip()
         elif sensor == "rotors" and e["kind"] == "thrust" and e["t_isolated"] is not None:
             name = f"rotor {axis} or its tachometer"
         elif sensor == "model" and e["t_isolated"] is not None:
