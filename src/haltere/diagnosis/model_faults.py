@@ -270,6 +270,12 @@ def lately(s: Any, i: int) -> float:
 
 
 @jit
+def returned(p: Any, i: int, size: float) -> bool:
+    """Whether a change of moment is for the most part the end of what the model was off by before: a model that fits again is no fault."""
+    return abs(p.m_drift[p.mark, i] + size) < REVERSE * abs(size)
+
+
+@jit
 def ended(p: Any, bit: int, k: int, size: float) -> bool:
     """Whether a change is the end of the fault ``k`` that lasts."""
     return (p.wrong >> bit) & 1 == 1 and abs(size + p.was[k]) < REVERSE * abs(p.was[k])
@@ -390,11 +396,15 @@ def of_moments(s: Any, prm: Any) -> bool:
             both = (UP << (B_ROTOR + first)) | (UP << (B_ROTOR + other)) | (UP << (B_TACHOMETER + first)) | (UP << (B_TACHOMETER + other))
             tell(s, E_SUSPECT, ROTOR + first, thrust, 0.02, both)
             return True
+        if (p.wrong >> (6 + first)) & 1 == 0 and returned(p, R, m_r) and returned(p, P, m_p):
+            return True
         bits = (UP << (B_ROTOR + first)) | (UP << (B_TACHOMETER + first))
         conclude(s, 6 + first, ROTOR + first, thrust, 0.02, bits, E_FAULT)
         lift(s, first, thrust, m_q, s_q)
         return True
     size, sd = lately(s, axis), s_r if axis == R else (s_p if axis == P else s_q)
+    if (p.wrong >> axis) & 1 == 0 and returned(p, axis, size):
+        return True
     if abs(size) > max(least_moment, SURE * sd):  # what the vehicle file says the model is off by is no fault
         conclude(s, axis, MODEL + axis, size, sd, UP << axis, E_FAULT)
         return True
