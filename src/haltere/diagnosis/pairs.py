@@ -148,7 +148,7 @@ def use_bias(s: Any) -> None:
 def restart(s: Any) -> None:
     """Forget chains and alarms: on the ground, without rotor speeds, after alignment."""
     p = s.pairs[0]
-    p.t_across, p.t_deaf, p.headings = -1e9, -1e9, 0
+    p.t_across, p.t_deaf, p.t_dull, p.headings = -1e9, -1e9, -1e9, 0
     forget_means(p)
     p.n, p.span, p.t_first, p.t_bias, p.stir, p.calm, p.n_stir, p.n_blocks, p.trial = 0.0, 0.0, 0.0, -1e9, 1.0, 1.0, 0.0, 0, 0
     p.hard = 0.0
@@ -299,7 +299,7 @@ def listen(s: Any, prm: Any) -> bool:
         factor = max(1.0, BEYOND_USUAL * p.usual[i])
         if over > factor and enough and (p.t_alarm[i] == 0.0 or p.t_hint[i] < p.t_alarm[i]):
             p.t_hint[i], p.hint_sign[i] = s.t, sign  # a witness is one at its full threshold only
-        factor *= LOOK if i < FORCES else 1.0
+        factor *= LOOK if i < FORCES and s.t >= p.t_dull else 1.0
         if over > factor and p.t_alarm[i] == 0.0 and enough:
             p.t_alarm[i], p.told_size[i] = s.t, size
             if p.t_first == 0.0:
