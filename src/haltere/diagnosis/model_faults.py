@@ -75,8 +75,8 @@ DOWN, TYPICAL_DRAG = 0.5, 0.3
 #: has the probability Φ(-(d + 16)/(2 √d)), at most that of four sigma; along z, where it hears height too, its innovations are less white.
 #: By what part the size may be off: a few blocks have told it. An onset of the bank is one of the pair if so near [s].
 AGAINST, AGAINST_Z, ABOUT, NEAR = 16.0, 36.0, 0.3, 0.5
-#: How long forces are not listened to [s]: after a verdict, and while levels begin anew; and for how long only at their full threshold, after
-#: a change of the wind, and where there was nothing.
+#: How long forces are not listened to [s]: after a verdict, and while levels begin anew; and for how long only at their full threshold:
+#: after a change of the wind, and where there was nothing.
 DEAF, ANEW, SOON, BRIEFLY = 5.0, 0.15, 1.5, 0.5
 #: A fault is over when the change is its reverse within this part.
 REVERSE = 0.4

@@ -33,8 +33,8 @@ FORCE, CHANGE, WALK = 1.5, 4.0, 0.1
 FAST, TURNED = 1.0, 0.2
 #: Least 1 sigma of what a level before the change is off by [m/s^2].
 LEAST = 0.03
-#: 1 sigma of the part that a force's slope by velocity is off by.
-SLOPE = 0.15
+#: 1 sigma of the part that a force's slope by velocity is off by, across the thrust axis and along it.
+SLOPE, INFLOW = 0.03, 0.1
 #: Time between later beginnings of a trial, and age of one that a fault of now is not in yet [s].
 QUARTER, AGED = 0.25, 0.4
 ZERO: Vec = (0.0, 0.0, 0.0)
@@ -69,7 +69,8 @@ def begin(s: Any, var: Vec) -> None:
             for k in range(STATES):
                 p.tried_P[h, j, k] = 0.0
         for i in range(FORCES):
-            p.tried_P[h, OFF + i, OFF + i], p.tried_P[h, SLOPES + i, SLOPES + i] = var[i], SLOPE * SLOPE
+            part = SLOPE if i < FORCES - 1 else INFLOW
+            p.tried_P[h, OFF + i, OFF + i], p.tried_P[h, SLOPES + i, SLOPES + i] = var[i], part * part
         if h < FORCES:
             p.tried_P[h, PUSH, PUSH] = FORCE * FORCE
     for i in range(2):
