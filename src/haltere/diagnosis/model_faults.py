@@ -23,7 +23,7 @@ from haltere.diagnosis.model_detectors import testify
 from haltere.diagnosis.pairs import BLOCK, CALM_ENOUGH, calm_again, change, listen, shift_bias, would_show
 from haltere.diagnosis.rate_step import began, shape
 from haltere.diagnosis.stand_in import density_of_noise, mark_before, offset_variance
-from haltere.diagnosis.wind_or_force import NOTHING, PUSH, WIND, again, best, by_chance, follow, held, latest, start
+from haltere.diagnosis.wind_or_force import NOTHING, PUSH, again, against_wind, best, by_chance, follow, held, latest, start
 from haltere.filter.signatures import ACCEL, SLOTS, clear
 from haltere.strapdown.pairs import LATELY
 from haltere.strapdown.propagate import gusts, inject
@@ -222,15 +222,16 @@ def settle_forces(s: Any, deaf: float, dull: float) -> None:
 
 
 @jit
-def go_on(s: Any) -> None:
+def go_on(s: Any, dull: float) -> None:
     """End a trial that came to nothing: levels are what it has found them to be, and a fault that has just come is still heard."""
     p = s.pairs[0]
-    x, y, z = held(s, 0), held(s, 1), held(s, T)
-    settle_forces(s, ANEW if x[1] < 0.0 else 0.0, BRIEFLY)
+    k = held(s)
+    settle_forces(s, ANEW if k < 0 else 0.0, dull)
+    if k < 0:
+        return
+    p.t_held, p.wind_held[0], p.wind_held[1] = s.t, p.later_wind[0, k], p.later_wind[1, k]
     for i in range(FORCES):
-        level, var = x if i == 0 else (y if i == 1 else z)
-        if var >= 0.0:
-            p.level[i], p.P[i, 0] = level, var
+        p.level[i], p.P[i, 0] = p.later_level[i, k], p.later_var[i, k]
 
 
 @jit
@@ -482,7 +483,7 @@ def of_forces(s: Any, prm: Any, since: float) -> None:
         again(s, slot)
         return
     a = best(s)
-    gap = p.misfit[WIND] - p.misfit[a]
+    gap = against_wind(p, a)
     others, worth = 1e18, p.misfit[NOTHING] - p.misfit[a]  # against another axis, and against no fault at all
     for i in range(FORCES):
         if i != a:
@@ -493,7 +494,7 @@ def of_forces(s: Any, prm: Any, since: float) -> None:
         return
     small = abs(size) < max(0.5 * prm.diagnosis_force, BEYOND_GUSTS * by_gusts(s, prm, a))
     if since > 1.0 and more < PERHAPS and (small or (since > 1.5 and worth < LITTLE * min(since, 3.0))):  # gusts, chance, or gone by itself
-        go_on(s)
+        go_on(s, BRIEFLY)
         return
     if len(s.bank) > 0 and s.bank[0].alarm != 0 and since < WAIT:  # an inertial fault is about to be named
         return
@@ -510,4 +511,4 @@ def of_forces(s: Any, prm: Any, since: float) -> None:
     if since > WAIT and more < PERHAPS:
         if worth > SURE and quiet == 0 and not windy:  # three that it may be are no verdict
             conclude(s, a, MODEL + a, size, 0.05, (UP << a) | (UP << (B_ACCEL + a)), E_SUSPECT)
-        settle_forces(s, ANEW, SOON)
+        go_on(s, SOON)

@@ -19,13 +19,14 @@ import math
 from typing import Any
 
 from haltere._jit import constant, jit
+from haltere.aids.air import wind_n
 from haltere.core.rotation import Vec, dcm, tmat_vec
 from haltere.diagnosis.drifts import LASTS, lasting, walk_of
 from haltere.diagnosis.pairs import sector, yaw
 from haltere.strapdown.pairs import LATER
 from haltere.vehicle.linear import linear
 
-__all__ = ["NOTHING", "PUSH", "WIND", "again", "best", "by_chance", "follow", "held", "latest", "start"]
+__all__ = ["NOTHING", "PUSH", "WIND", "again", "against_wind", "best", "by_chance", "follow", "held", "latest", "start"]
 
 #: 1 sigma of a force and of a change of wind before anything is known [m/s^2, m/s]; how the wind walks meanwhile [m/s/sqrt(s)].
 FORCE, CHANGE, WALK = 1.5, 4.0, 0.1
@@ -33,13 +34,16 @@ FORCE, CHANGE, WALK = 1.5, 4.0, 0.1
 FAST, TURNED = 1.0, 0.2
 #: Least 1 sigma of what a level before the change is off by [m/s^2].
 LEAST = 0.03
-#: 1 sigma of the part that a force's slope by velocity is off by, across the thrust axis and along it.
-SLOPE, INFLOW = 0.03, 0.1
+#: 1 sigma of the part that a force's slope by velocity is off by.
+SLOPE = 0.03
+#: Most that the force along the thrust axis says of a wind against a force across: a wind of 2 m/s lifts by 0.15 m/s^2, and the model is
+#: off by as much where the vehicle climbs faster.
+BY_LIFT = 2.0
 #: Time between later beginnings of a trial, and age of one that a fault of now is not in yet [s].
 QUARTER, AGED = 0.25, 0.4
 ZERO: Vec = (0.0, 0.0, 0.0)
 #: Hypotheses, the first three of which are forces along x, y, z; states, and where they begin.
-WIND, NOTHING, TRIED, FORCES, STATES, OFF, PUSH, BEFORE, SLOPES = (constant(i) for i in (3, 4, 5, 3, 11, 2, 5, 6, 8))
+Z, WIND, NOTHING, TRIED, FORCES, STATES, OFF, PUSH, BEFORE, SLOPES = (constant(i) for i in (2, 3, 4, 5, 3, 11, 2, 5, 6, 8))
 
 
 @jit
@@ -63,14 +67,13 @@ def begin(s: Any, var: Vec) -> None:
     for i in range(FORCES):
         p.air[i] = air[i]
     for h in range(TRIED):
-        p.misfit[h], p.chance[h] = 0.0, 0.0
+        p.misfit[h], p.along_z[h], p.chance[h] = 0.0, 0.0, 0.0
         for j in range(STATES):
             p.tried[h, j] = 0.0
             for k in range(STATES):
                 p.tried_P[h, j, k] = 0.0
         for i in range(FORCES):
-            part = SLOPE if i < FORCES - 1 else INFLOW
-            p.tried_P[h, OFF + i, OFF + i], p.tried_P[h, SLOPES + i, SLOPES + i] = var[i], part * part
+            p.tried_P[h, OFF + i, OFF + i], p.tried_P[h, SLOPES + i, SLOPES + i] = var[i], SLOPE * SLOPE
         if h < FORCES:
             p.tried_P[h, PUSH, PUSH] = FORCE * FORCE
     for i in range(2):
@@ -110,16 +113,14 @@ def latest(s: Any) -> tuple[float, int, int, float]:
 
 
 @jit
-def held(s: Any, i: int) -> tuple[float, float]:
-    """Level of the residual of a force, in the filter's wind as it is, and its variance, without a fault of now; -1: not known."""
+def held(s: Any) -> int:
+    """Latest of the later beginnings that a fault of now is not in yet; -1: none."""
     p = s.pairs[0]
     k, t = -1, -1.0
     for j in range(LATER):
-        if p.later[j] > t and p.later[j] < s.t - AGED:
+        if p.trial == 1 and p.later[j] > t and p.later[j] < s.t - AGED:
             k, t = j, p.later[j]
-    if p.trial == 0 or k < 0:
-        return 0.0, -1.0
-    return float(p.base[i] + p.later_off[i, k] - p.follows[i]), float(p.later_var[i, k])
+    return k
 
 
 @jit
@@ -187,6 +188,7 @@ def follow(s: Any, dt: float) -> None:
                     p.gain[j] += p.tried_P[h, j, k] * p.row[k]
                 S += p.row[j] * p.gain[j]
             p.misfit[h] += x * x / S
+            p.along_z[h] += x * x / S if i == Z else 0.0
             p.chance[h] += math.log(S)
             if h == NOTHING:
                 match(p, i, x, S, 1.0 - R / S)
@@ -202,6 +204,8 @@ def follow(s: Any, dt: float) -> None:
         k = p.n_later % LATER
         p.n_later += 1
         p.t_later, p.later[k] = s.t + QUARTER, s.t
+        W = wind_n(s)
+        p.later_wind[0, k], p.later_wind[1, k] = W[0], W[1]
         for h in range(TRIED):
             p.later_fit[h, k] = p.misfit[h]
 
@@ -234,8 +238,18 @@ def keep(p: Any, i: int, k: int) -> None:
         value += p.row[j] * p.tried[NOTHING, j]
         for n in range(STATES):
             var += p.row[j] * p.tried_P[NOTHING, j, n] * p.row[n]
-    p.later_off[i, k], p.later_var[i, k] = value, var
+    p.later_off[i, k], p.later_var[i, k], p.later_level[i, k] = value, var, p.base[i] + value - p.follows[i]
     p.followed[i, k], p.later_num[i, k], p.later_den[i, k] = 0.0, 0.0, 0.0
+
+
+@jit
+def against_wind(p: Any, a: int) -> float:
+    """How much better a force along axis ``a`` explains than a wind, in twice the log likelihood."""
+    gap = p.misfit[WIND] - p.misfit[a]
+    if a != Z:
+        lift = p.along_z[WIND] - p.along_z[a]
+        gap += min(max(lift, -BY_LIFT), BY_LIFT) - lift
+    return float(gap)
 
 
 @jit

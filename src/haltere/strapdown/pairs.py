@@ -119,11 +119,14 @@ def pairs() -> np.dtype[np.void]:
                 ("t_lately", "f8", int(LATELY)),
                 ("n_lately", "i8"),
                 ("lag", "i8"),  # mark of the wind that forces are compared in
+                ("wind_held", "f8", 2),  # the same after a trial that came to nothing, and when it ended
+                ("t_held", "f8"),
                 # trial of what a change of force is: of the model along x, y, z, wind, or nothing; misfits, sums of the logarithms of the
                 # innovations' variances
                 ("trial", "i8"),
                 ("both", "i8"),  # 1: that it is one or the other was told
                 ("misfit", "f8", 5),
+                ("along_z", "f8", 5),  # the part of a misfit that is of the force along z
                 ("chance", "f8", 5),
                 # the filters of these: change of wind (2), what the model is off by (3), force, error of the wind before (2), parts that
                 # the slopes by velocity are off by (3); covariances, room for a row and a gain
@@ -145,6 +148,8 @@ def pairs() -> np.dtype[np.void]:
                 ("later", "f8", int(LATER)),
                 ("later_off", "f8", (3, int(LATER))),
                 ("later_var", "f8", (3, int(LATER))),
+                ("later_level", "f8", (3, int(LATER))),  # the same as a residual in the filter's wind of then, and that wind
+                ("later_wind", "f8", (2, int(LATER))),
                 ("followed", "f8", (3, int(LATER))),
                 ("later_num", "f8", (3, int(LATER))),
                 ("later_den", "f8", (3, int(LATER))),
