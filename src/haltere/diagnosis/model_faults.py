@@ -23,7 +23,7 @@ from haltere.diagnosis.model_detectors import testify
 from haltere.diagnosis.pairs import BLOCK, CALM_ENOUGH, calm_again, change, listen, shift_bias, would_show
 from haltere.diagnosis.rate_step import began, shape
 from haltere.diagnosis.stand_in import density_of_noise, mark_before, offset_variance
-from haltere.diagnosis.wind_or_force import NOTHING, PUSH, again, against_wind, best, by_chance, follow, held, latest, start
+from haltere.diagnosis.wind_or_force import NOTHING, PUSH, again, against_wind, best, by_chance, by_old_wind, follow, held, latest, start
 from haltere.filter.signatures import ACCEL, SLOTS, clear
 from haltere.strapdown.pairs import LATELY
 from haltere.strapdown.propagate import gusts, inject
@@ -58,6 +58,9 @@ SURE, WORTH, LITTLE = 40.0, 20.0, 4.0
 #: How much more a later step must explain than all that is tried, in the same measure, for the trial to begin anew there.
 #: While it explains this much more, no trial ends as one of nothing.
 AFRESH, PERHAPS = 10.0, 4.0
+#: What must speak against a wind when no more is waited for; how many sigma of an error of the wind before a force must be that a wind
+#: explains as well, where the vehicle has turned to a new heading.
+LATE, BEYOND_WIND = 3.0, 2.5
 #: Two rotors that explain alike within the first are both named, within the second they are looked at for longer.
 NEARLY, UNLIKE = 1.0, 3.0
 #: A moment that has lasted for so long [s] before its alarm is dated anew.
@@ -490,7 +493,10 @@ def of_forces(s: Any, prm: Any, since: float) -> None:
             others = min(others, p.misfit[i] - p.misfit[a])
     size = p.tried[a, PUSH]
     if since > COMPARED and gap < (-MARGIN if since > WAIT else -SURE):
-        settle_forces(s, ANEW, SOON)
+        if since > WAIT:
+            go_on(s, SOON)
+        else:
+            settle_forces(s, ANEW, SOON)
         return
     small = abs(size) < max(0.5 * prm.diagnosis_force, BEYOND_GUSTS * by_gusts(s, prm, a))
     if since > 1.0 and more < PERHAPS and (small or (since > 1.5 and worth < LITTLE * min(since, 3.0))):  # gusts, chance, or gone by itself
@@ -500,7 +506,11 @@ def of_forces(s: Any, prm: Any, since: float) -> None:
         return
     quiet = silent(s, prm, a, size)
     decided = gap + (by_chance(s, a) if p.moved > 1.0 else 0.0)  # in hover a wind along an axis is no chance to convict on
-    windy = decided < (MARGIN if since < WAIT else 0.5 * MARGIN) or len(s.wind) == 0
+    windy = decided < (MARGIN if since < WAIT else LATE) or len(s.wind) == 0
+    if gap < MARGIN and abs(size) < BEYOND_WIND * by_old_wind(s, a):  # as well the wind before, which was not known so well
+        if since > WAIT and more < PERHAPS:
+            go_on(s, SOON)
+        return
     if worth > WORTH and others > MARGIN and not windy and quiet == 1:
         conclude(s, a, MODEL + a, size, 0.05, UP << a, E_FAULT)
         settle_forces(s, DEAF, DEAF)

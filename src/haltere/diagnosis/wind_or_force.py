@@ -26,7 +26,7 @@ from haltere.diagnosis.pairs import sector, yaw
 from haltere.strapdown.pairs import LATER
 from haltere.vehicle.linear import linear
 
-__all__ = ["NOTHING", "PUSH", "WIND", "again", "against_wind", "best", "by_chance", "follow", "held", "latest", "start"]
+__all__ = ["NOTHING", "PUSH", "WIND", "again", "against_wind", "best", "by_chance", "by_old_wind", "follow", "held", "latest", "start"]
 
 #: 1 sigma of a force and of a change of wind before anything is known [m/s^2, m/s]; how the wind walks meanwhile [m/s/sqrt(s)].
 FORCE, CHANGE, WALK = 1.5, 4.0, 0.1
@@ -124,17 +124,33 @@ def held(s: Any) -> int:
 
 
 @jit
+def old_wind(s: Any, i: int) -> float:
+    """Variance of the wind as the filter knows it, north or east [m^2/s^2]."""
+    o = 15 + len(s.baro) + len(s.mag) + i
+    per = math.exp(-s.drag[0]) if len(s.drag) > 0 else 1.0
+    return float(s.P[o, o] * per * per)
+
+
+@jit
 def open_wind(s: Any) -> None:
     """Once the vehicle heads to where it has not headed before: the wind before may have been wrong by what the filter says."""
-    p, o = s.pairs[0], 15 + len(s.baro) + len(s.mag)
+    p = s.pairs[0]
     p.opened = 0
     if len(s.wind) == 0 or (p.headings >> sector(yaw(s))) & 1 == 1:
         return
     p.opened = 1
-    per = math.exp(-s.drag[0]) if len(s.drag) > 0 else 1.0
     for h in range(TRIED):
         for i in range(2):
-            p.tried_P[h, BEFORE + i, BEFORE + i] += s.P[o + i, o + i] * per * per
+            p.tried_P[h, BEFORE + i, BEFORE + i] += old_wind(s, i)
+
+
+@jit
+def by_old_wind(s: Any, a: int) -> float:
+    """1 sigma of the force along axis ``a`` that an error of the wind before makes, where a new heading has been turned to [m/s^2]."""
+    p = s.pairs[0]
+    if p.opened != 1 or a == Z or len(s.wind) == 0:
+        return 0.0
+    return float(abs(p.by_v[0, a, a]) * math.sqrt(0.5 * (old_wind(s, 0) + old_wind(s, 1))))
 
 
 @jit
