@@ -515,7 +515,8 @@ def of_forces(s: Any, prm: Any, since: float) -> None:
         conclude(s, a, MODEL + a, size, 0.05, UP << a, E_FAULT)
         settle_forces(s, DEAF, DEAF)
         return
-    if worth > WORTH and since > COMPARED and gap > -MARGIN and quiet == 1 and p.both == 0:  # both, until the vehicle has turned
+    near = 0.0 if p.moved > 1.0 else -MARGIN  # in flight a wind that explains better is not named beside a force
+    if worth > WORTH and since > COMPARED and gap > near and quiet == 1 and p.both == 0:  # both, until the vehicle has turned
         p.both = 1
         conclude(s, a, MODEL + a, size, 0.05, (UP << a) | (UP << B_WIND), E_SUSPECT)
     if since > WAIT and more < PERHAPS:
