@@ -141,6 +141,19 @@ def test_columns_have_units_frames_and_words(stream: str) -> None:
             assert column.frame, f"{column.name} is a vector component without a frame"
 
 
+def test_a_constant_is_given_once() -> None:
+    """A second value under a name would silently be the first one's too: kernels take what stands last."""
+    for path in MODULES:
+        given = [
+            name.id
+            for node in ast.parse(path.read_text(encoding="utf-8")).body
+            for target in (node.targets if isinstance(node, ast.Assign) else [node.target] if isinstance(node, ast.AnnAssign) else [])
+            for name in ast.walk(target)
+            if isinstance(name, ast.Name) and isinstance(name.ctx, ast.Store) and name.id.isupper() and not name.id.startswith("_")
+        ]
+        assert len(given) == len(set(given)), f"{path}: {sorted(n for n in set(given) if given.count(n) > 1)}"
+
+
 def test_no_field_of_a_record_is_hidden_in_plain_python() -> None:
     """`np.record` has methods; a field of such a name is read as the method when kernels run as plain Python."""
     only_written = {("strapdown/layout.py", "size"), ("estimators/smoother.py", "T")}

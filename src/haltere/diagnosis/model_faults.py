@@ -25,7 +25,7 @@ from haltere.diagnosis.model_detectors import testify
 from haltere.diagnosis.pairs import BLOCK, CALM_ENOUGH, calm_again, change, listen, shift_bias, would_show
 from haltere.diagnosis.rate_step import began, shape
 from haltere.diagnosis.stand_in import density_of_noise, mark_before, offset_variance
-from haltere.diagnosis.wind_or_force import WIND, best, by_chance, follow, start
+from haltere.diagnosis.wind_or_force import NOTHING, PUSH, again, against_wind, best, by_chance, by_old_wind, follow, held, latest, start
 from haltere.filter.signatures import ACCEL, SLOTS, clear
 from haltere.strapdown.pairs import LATELY
 from haltere.strapdown.propagate import gusts, inject
@@ -57,6 +57,12 @@ MARGIN, LIKE, LEAST_M, LEAST_F = 9.0, 0.2, 0.15, 0.04
 #: A change that is the wind beyond doubt, soon; what a force must explain better than what the model is off by in this flight, and less
 #: than what a second it is not looked at any longer.
 SURE, WORTH, LITTLE = 40.0, 20.0, 4.0
+#: How much more a later step must explain than all that is tried, in the same measure, for the trial to begin anew there.
+#: While it explains this much more, no trial ends as one of nothing.
+AFRESH, PERHAPS = 10.0, 4.0
+#: What must speak against a wind when no more is waited for; how many sigma of an error of the wind before a force must be that a wind
+#: explains as well, where the vehicle has turned to a new heading.
+LATE, BEYOND_WIND = 3.0, 2.5
 #: Two rotors that explain alike within the first are both named, within the second they are looked at for longer.
 NEARLY, UNLIKE = 1.0, 3.0
 #: A moment that has lasted for so long [s] before its alarm is dated anew.
@@ -74,8 +80,9 @@ DOWN, TYPICAL_DRAG = 0.5, 0.3
 #: has the probability Φ(-(d + 16)/(2 √d)), at most that of four sigma; along z, where it hears height too, its innovations are less white.
 #: By what part the size may be off: a few blocks have told it. An onset of the bank is one of the pair if so near [s].
 AGAINST, AGAINST_Z, ABOUT, NEAR = 16.0, 36.0, 0.3, 0.5
-#: How long forces are not listened to [s]: after a verdict, after a change of the wind, and where there was nothing.
-DEAF, SOON, BRIEFLY = 5.0, 1.5, 0.5
+#: How long forces are not listened to [s]: after a verdict, and while levels begin anew; and for how long only at their full threshold:
+#: after a change of the wind, and where there was nothing.
+DEAF, ANEW, SOON, BRIEFLY = 5.0, 0.15, 1.5, 0.5
 #: A fault is over when the change is its reverse within this part.
 REVERSE = 0.4
 #: A step of the gyro and the onset of what turned the compass are one if so near [s]; part of a step that its size may be off by.
@@ -89,7 +96,7 @@ AS_GUSTS, PART = 1.5, 0.6
 #: What the model of a moment is off by as a part of the largest of late: constants, and the time of a rotor's speed.
 HARD = 0.05
 #: How many sigma of it a moment of the model alone must be.
-SURE = 2.0
+SIGMAS = 2.0
 UP, FORCES, T, R, P, Q = (constant(i) for i in (1, 3, 2, 3, 4, 5))
 
 
@@ -187,7 +194,7 @@ def judge(s: Any, prm: Any) -> None:
         if of_moments(s, prm) or since > LONGER:
             settle(s)
     elif late:  # a force was looked at, and there is something new: it alarms again by itself
-        settle_forces(s, SOON)
+        settle_forces(s, ANEW, SOON)
     elif p.t_alarm[0] != 0.0 or p.t_alarm[1] != 0.0 or p.t_alarm[T] != 0.0:
         of_forces(s, prm, since)
     else:
@@ -207,16 +214,29 @@ def settle(s: Any) -> None:
 
 
 @jit
-def settle_forces(s: Any, deaf: float) -> None:
-    """The same of forces alone, which are not listened to for some seconds: rates are as before."""
+def settle_forces(s: Any, deaf: float, dull: float) -> None:
+    """The same of forces alone, which are not listened to for some seconds, and then at their full threshold: rates are as before."""
     p = s.pairs[0]
-    p.t_first, p.trial, p.t_across, p.t_deaf = 0.0, 0, s.t, s.t + deaf
+    p.t_first, p.trial, p.t_across, p.t_deaf, p.t_dull = 0.0, 0, s.t, s.t + deaf, s.t + dull
     forget_means(p)
     for i in range(6):
         if i < FORCES:
             calm_again(s, i)
         p.t_alarm[i], p.told_size[i] = 0.0, 0.0
     p.still = 0
+
+
+@jit
+def go_on(s: Any, dull: float) -> None:
+    """End a trial that came to nothing: levels are what it has found them to be, and a fault that has just come is still heard."""
+    p = s.pairs[0]
+    k = held(s)
+    settle_forces(s, ANEW if k < 0 else 0.0, dull)
+    if k < 0:
+        return
+    p.t_held, p.wind_held[0], p.wind_held[1] = s.t, p.later_wind[0, k], p.later_wind[1, k]
+    for i in range(FORCES):
+        p.level[i], p.P[i, 0] = p.later_level[i, k], p.later_var[i, k]
 
 
 @jit
@@ -405,7 +425,7 @@ def of_moments(s: Any, prm: Any) -> bool:
     size, sd = lately(s, axis), s_r if axis == R else (s_p if axis == P else s_q)
     if (p.wrong >> axis) & 1 == 0 and returned(p, axis, size):
         return True
-    if abs(size) > max(least_moment, SURE * sd):  # what the vehicle file says the model is off by is no fault
+    if abs(size) > max(least_moment, SIGMAS * sd):  # what the vehicle file says the model is off by is no fault
         conclude(s, axis, MODEL + axis, size, sd, UP << axis, E_FAULT)
         return True
     return bool(s.t >= p.onset + UNDECIDED)
@@ -482,35 +502,51 @@ def of_forces(s: Any, prm: Any, since: float) -> None:
             start(s)
             return
     if p.still < 0:  # wind, whatever else
-        settle_forces(s, SOON)
+        settle_forces(s, ANEW, SOON)
+        return
+    more, axis, slot, step = latest(s)
+    if more > AFRESH and abs(step) > prm.diagnosis_force:  # whatever it began for, this is more: it is looked at from here on
+        p.onset, p.t_first, p.statistic, p.threshold = p.later[slot], s.t, more, AFRESH
+        for i in range(FORCES):
+            p.t_alarm[i], p.told_size[i] = 0.0, 0.0
+        p.t_alarm[axis], p.told_size[axis] = s.t, step
+        again(s, slot)
         return
     a = best(s)
-    gap = p.misfit[WIND] - p.misfit[a]
-    others, worth = 1e18, p.unpushed[a] - p.pushed[a]  # against another axis, and against no fault at all
+    gap = against_wind(p, a)
+    others, worth = 1e18, p.misfit[NOTHING] - p.misfit[a]  # against another axis, and against no fault at all
     for i in range(FORCES):
         if i != a:
             others = min(others, p.misfit[i] - p.misfit[a])
-    size = p.push[a]
+    size = p.tried[a, PUSH]
     if since > COMPARED and gap < (-MARGIN if since > WAIT else -SURE):
-        settle_forces(s, SOON)
+        if since > WAIT:
+            go_on(s, SOON)
+        else:
+            settle_forces(s, ANEW, SOON)
         return
     small = abs(size) < max(0.5 * prm.diagnosis_force, BEYOND_GUSTS * by_gusts(s, prm, a))
-    if since > 1.0 and (small or (since > 1.5 and worth < LITTLE * min(since, 3.0))):  # gusts, chance, or gone by itself
-        settle_forces(s, BRIEFLY)
+    if since > 1.0 and more < PERHAPS and (small or (since > 1.5 and worth < LITTLE * min(since, 3.0))):  # gusts, chance, or gone by itself
+        go_on(s, BRIEFLY)
         return
     if len(s.bank) > 0 and s.bank[0].alarm != 0 and since < WAIT:  # an inertial fault is about to be named
         return
     quiet = silent(s, prm, a, size)
     decided = gap + (by_chance(s, a) if p.moved > 1.0 else 0.0)  # in hover a wind along an axis is no chance to convict on
-    windy = decided < (MARGIN if since < WAIT else 0.5 * MARGIN) or len(s.wind) == 0
+    windy = decided < (MARGIN if since < WAIT else LATE) or len(s.wind) == 0
+    if gap < MARGIN and abs(size) < BEYOND_WIND * by_old_wind(s, a):  # as well the wind before, which was not known so well
+        if since > WAIT and more < PERHAPS:
+            go_on(s, SOON)
+        return
     if worth > WORTH and others > MARGIN and not windy and quiet == 1:
         conclude(s, a, MODEL + a, size, 0.05, UP << a, E_FAULT)
-        settle_forces(s, DEAF)
+        settle_forces(s, DEAF, DEAF)
         return
-    if worth > WORTH and since > COMPARED and gap > -MARGIN and quiet == 1 and p.both == 0:  # both, until the vehicle has turned
+    near = 0.0 if p.moved > 1.0 else -MARGIN  # in flight a wind that explains better is not named beside a force
+    if worth > WORTH and since > COMPARED and gap > near and quiet == 1 and p.both == 0:  # both, until the vehicle has turned
         p.both = 1
         conclude(s, a, MODEL + a, size, 0.05, (UP << a) | (UP << B_WIND), E_SUSPECT)
-    if since > WAIT:
-        if worth > WORTH and quiet == 0 and not windy:  # three that it may be are no verdict
+    if since > WAIT and more < PERHAPS:
+        if worth > SURE and quiet == 0 and not windy:  # three that it may be are no verdict
             conclude(s, a, MODEL + a, size, 0.05, (UP << a) | (UP << (B_ACCEL + a)), E_SUSPECT)
-        settle_forces(s, SOON)
+        go_on(s, SOON)

@@ -63,6 +63,8 @@ LOOK = 0.5
 HARD_FOR = 0.98
 #: Forces are compared in the wind of so long ago [s].
 LAG = 1.0
+#: For so long [s] after a trial of forces that came to nothing the wind of before its end is that before a change.
+HOLDS = 0.3
 #: Memory of gusts [s].
 STIR = 20.0
 #: For so long [s] after a verdict on forces they are held against no accelerometer.
@@ -147,7 +149,7 @@ def use_bias(s: Any) -> None:
 def restart(s: Any) -> None:
     """Forget chains and alarms: on the ground, without rotor speeds, after alignment."""
     p = s.pairs[0]
-    p.t_across, p.t_deaf, p.headings = -1e9, -1e9, 0
+    p.t_across, p.t_deaf, p.t_dull, p.t_held, p.headings = -1e9, -1e9, -1e9, -1e9, 0
     forget_means(p)
     p.n, p.span, p.t_first, p.t_bias, p.stir, p.calm, p.n_stir, p.n_blocks, p.trial = 0.0, 0.0, 0.0, -1e9, 1.0, 1.0, 0.0, 0, 0
     p.hard = 0.0
@@ -298,7 +300,7 @@ def listen(s: Any, prm: Any) -> bool:
         factor = usual.raised(p, i)
         if over > factor and enough and (p.t_alarm[i] == 0.0 or p.t_hint[i] < p.t_alarm[i]):
             p.t_hint[i], p.hint_sign[i] = s.t, sign  # a witness is one at its full threshold only
-        factor *= LOOK if i < FORCES else 1.0
+        factor *= LOOK if i < FORCES and s.t >= p.t_dull else 1.0
         if over > factor and p.t_alarm[i] == 0.0 and enough:
             p.t_alarm[i], p.told_size[i] = s.t, size
             if p.t_first == 0.0:
@@ -334,10 +336,12 @@ def dot_row(p: Any, i: int, v: Vec) -> float:
 def by_lag(s: Any) -> Vec:
     """Wind of a while ago less that of now, body frame [m/s]: an estimate that follows at once would hide a change of force."""
     p = s.pairs[0]
-    if p.lag < 0:
+    held = s.t < p.t_held + LAG
+    if p.lag < 0 and not held:
         return (0.0, 0.0, 0.0)
     W = wind_n(s)
-    return tmat_vec(dcm((s.q[0], s.q[1], s.q[2], s.q[3])), (p.m_wind[p.lag, 0] - W[0], p.m_wind[p.lag, 1] - W[1], 0.0))
+    n, e = (p.wind_held[0], p.wind_held[1]) if held else (p.m_wind[p.lag, 0], p.m_wind[p.lag, 1])
+    return tmat_vec(dcm((s.q[0], s.q[1], s.q[2], s.q[3])), (n - W[0], e - W[1], 0.0))
 
 
 @jit
@@ -367,6 +371,8 @@ def remember(s: Any, prm: Any) -> None:
         p.m_turn[k, i] = p.turn[i]
     W = wind_n(s)
     p.m_wind[k, 0], p.m_wind[k, 1], p.m_yaw[k] = W[0], W[1], yaw(s)
+    if s.t < p.t_held + HOLDS:  # a fault that came just before has not bent it
+        p.m_wind[k, 0], p.m_wind[k, 1] = p.wind_held[0], p.wind_held[1]
     p.headings |= 1 << sector(p.m_yaw[k])
     p.lag = mark_before(p, s.t - LAG)
     if p.lag >= 0 and p.m_t[p.lag] < p.t_across:  # levels begin anew with a verdict: in the wind of then

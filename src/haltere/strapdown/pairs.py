@@ -9,7 +9,7 @@ import numpy as np
 from haltere._jit import constant
 from haltere.filter.windows import windows
 
-__all__ = ["LATELY", "MARKS", "MATCHED", "PAIR_WINDOW", "pairs"]
+__all__ = ["LATELY", "LATER", "MARKS", "MATCHED", "PAIR_WINDOW", "pairs"]
 
 #: Longest window of the detectors in blocks of a hundredth of a second, in a plain number: it is a modulus.
 PAIR_WINDOW = constant(512)
@@ -19,6 +19,8 @@ LATELY = constant(64)
 MATCHED = constant(24)
 #: Quarters of a second that the past of each pair is kept.
 MARKS = constant(40)
+#: Later beginnings of a trial of forces that are kept. In a plain number: it is a modulus.
+LATER = constant(8)
 
 
 @cache
@@ -106,7 +108,8 @@ def pairs() -> np.dtype[np.void]:
                 ("t_hint", "f8", 6),  # last alarm of each pair, whatever came of it, and its sign
                 ("hint_sign", "f8", 6),
                 ("t_across", "f8"),  # last verdict on forces was pending
-                ("t_deaf", "f8"),  # until when forces are not listened to
+                ("t_deaf", "f8"),  # until when forces are not listened to, and until when at their full threshold only
+                ("t_dull", "f8"),
                 ("t_step", "f8", 3),  # onset of the last step of a gyro axis that the rotors do not explain, and its size [rad/s]
                 ("step", "f8", 3),
                 ("out", "i8"),  # cause for which the compass was not heard, at the last block
@@ -115,26 +118,43 @@ def pairs() -> np.dtype[np.void]:
                 ("t_lately", "f8", int(LATELY)),
                 ("n_lately", "i8"),
                 ("lag", "i8"),  # mark of the wind that forces are compared in
-                # trial of what a change of force is: of the model along x, y, z, or wind; misfits, of an axis with a force and without,
-                # sizes and what the model is off by with variances, wind before
+                ("wind_held", "f8", 2),  # the same after a trial that came to nothing, and when it ended
+                ("t_held", "f8"),
+                # trial of what a change of force is: of the model along x, y, z, wind, or nothing; misfits, sums of the logarithms of the
+                # innovations' variances
                 ("trial", "i8"),
                 ("both", "i8"),  # 1: that it is one or the other was told
-                ("misfit", "f8", 4),
-                ("chance", "f8", 4),
+                ("misfit", "f8", 5),
+                ("along_z", "f8", 5),  # the part of a misfit that is of the force along z
+                ("chance", "f8", 5),
+                # the filters of these: change of wind (2), what the model is off by (3), force, error of the wind before (2), parts that
+                # the slopes by velocity are off by (3); covariances, room for a row and a gain
+                ("tried", "f8", (5, 11)),
+                ("tried_P", "f8", (5, 11, 11)),
+                ("row", "f8", 11),
+                ("gain", "f8", 11),
                 ("moved", "f8"),  # most of what is no hover any more, speed or turn since, and the heading before
                 ("heading", "f8"),
-                ("turned", "f8"),  # largest turn since [rad]
-                ("pushed", "f8", 3),
-                ("unpushed", "f8", 3),
-                ("push", "f8", 3),
-                ("push_var", "f8", 3),
-                ("off", "f8", 3),
-                ("off_var", "f8", 3),
+                ("opened", "i8"),  # 1: the wind before counts as unknown, -1: just begun
+                # before: wind, level, velocity through the air; what the filter's own wind makes of the forces since
                 ("wind", "f8", 2),
-                # change of the wind north and east [m/s] and what the model is off by, covariance, room for a gain
-                ("blown", "f8", 5),
-                ("blown_P", "f8", (5, 5)),
-                ("gain", "f8", 5),
+                ("base", "f8", 3),
+                ("air", "f8", 3),
+                ("along", "f8", (3, 2)),  # slopes of forces by the wind before, at that heading
+                ("follows", "f8", 3),
+                # the same trial begun later, at the last quarters of a second: when, what nothing predicted then, its variance, how much of
+                # a step since has been taken for that, sums of products and squares, misfits then; when the next one is kept, and where
+                ("later", "f8", int(LATER)),
+                ("later_off", "f8", (3, int(LATER))),
+                ("later_var", "f8", (3, int(LATER))),
+                ("later_level", "f8", (3, int(LATER))),  # the same as a residual in the filter's wind of then, and that wind
+                ("later_wind", "f8", (2, int(LATER))),
+                ("followed", "f8", (3, int(LATER))),
+                ("later_num", "f8", (3, int(LATER))),
+                ("later_den", "f8", (3, int(LATER))),
+                ("later_fit", "f8", (5, int(LATER))),
+                ("t_later", "f8"),
+                ("n_later", "i8"),
                 ("healed", "i8"),
                 ("healed_out", "i8"),
                 ("t_healed", "f8"),
