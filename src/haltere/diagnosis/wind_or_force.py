@@ -54,7 +54,7 @@ def start(s: Any) -> None:
     for i in range(2):
         p.wind[i] = p.m_wind[p.mark, i]
     for i in range(FORCES):
-        p.base[i] = p.m_level[p.mark, i]
+        p.level_before[i] = p.m_level[p.mark, i]
     begin(s, (p.m_var[p.mark, 0] + LEAST * LEAST, p.m_var[p.mark, 1] + LEAST * LEAST, p.m_var[p.mark, 2] + LEAST * LEAST))
 
 
@@ -88,7 +88,7 @@ def again(s: Any, k: int) -> None:
     """Begin anew at the later beginning ``k``: what nothing predicted is what was there before."""
     p = s.pairs[0]
     for i in range(FORCES):
-        p.base[i] += p.later_off[i, k]
+        p.level_before[i] += p.later_off[i, k]
     p.heading = yaw(s)
     begin(s, (p.later_var[0, k], p.later_var[1, k], p.later_var[2, k]))
 
@@ -182,7 +182,7 @@ def follow(s: Any, dt: float) -> None:
         p.tried_P[WIND, i, i] += WALK * WALK * dt
     for i in range(FORCES):
         p.follows[i] = f_now[i] - f_0[i]
-        r, R, q = p.residual[i] - p.base[i] + p.follows[i], white(s, i, dt), walk_of(s, i) * dt
+        r, R, q = p.residual[i] - p.level_before[i] + p.follows[i], white(s, i, dt), walk_of(s, i) * dt
         for j in range(STATES):
             p.row[j] = 0.0
         p.row[OFF + i], p.row[SLOPES + i] = 1.0, D_0[i][i] * (air[i] - p.air[i])
@@ -254,7 +254,7 @@ def keep(p: Any, i: int, k: int) -> None:
         value += p.row[j] * p.tried[NOTHING, j]
         for n in range(STATES):
             var += p.row[j] * p.tried_P[NOTHING, j, n] * p.row[n]
-    p.later_off[i, k], p.later_var[i, k], p.later_level[i, k] = value, var, p.base[i] + value - p.follows[i]
+    p.later_off[i, k], p.later_var[i, k], p.later_level[i, k] = value, var, p.level_before[i] + value - p.follows[i]
     p.followed[i, k], p.later_num[i, k], p.later_den[i, k] = 0.0, 0.0, 0.0
 
 

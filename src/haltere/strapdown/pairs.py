@@ -138,7 +138,7 @@ def pairs() -> np.dtype[np.void]:
                 ("opened", "i8"),  # 1: the wind before counts as unknown, -1: just begun
                 # before: wind, level, velocity through the air; what the filter's own wind makes of the forces since
                 ("wind", "f8", 2),
-                ("base", "f8", 3),
+                ("level_before", "f8", 3),
                 ("air", "f8", 3),
                 ("along", "f8", (3, 2)),  # slopes of forces by the wind before, at that heading
                 ("follows", "f8", 3),
