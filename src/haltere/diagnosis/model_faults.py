@@ -112,6 +112,8 @@ def hear(s: Any, prm: Any) -> None:
         judge(s, prm)
     if len(s.bank) > 0 and s.bank[0].healed != p.healed_out:
         p.healed_out, p.t_healed = s.bank[0].healed, s.t
+        if p.t_first == 0.0:  # forces change with what was taken back
+            settle_forces(s, DEAF, DEAF)
     if s.compass.out != p.out:
         p.out = s.compass.out
         if p.out == OUT_TURN:
