@@ -272,6 +272,11 @@ def event(sensor: str, axis: str | None, onset: float, kind: str = "bias", *, is
             "2 faults were found: barometer, from t = 20.0 s; gyro x, from t = 35.0 s; what gyro x did was taken back",
         ),
         ([event("model", "hx", 20.0, isolated=False)], "The sensors agree"),
+        ([event("accel", "x", 33.4) | {"candidates": ["imu.2.accel.x"]}], "A fault was found: accelerometer x of imu.2, from t = 33.4 s."),
+        (
+            [event("rotors", None, 77.3, "thrust", isolated=False) | {"candidates": ["rotors"]}, event("gyro", "z", 30.0)],
+            "2 faults were found: gyro z, from t = 30.0 s; motion that is not what the rotors should make, from t = 77.3 s; what gyro z",
+        ),
     ],
 )
 def test_what_failed_is_the_headline(demo: Shown, events: list[dict[str, Any]], headline: str) -> None:

@@ -16,7 +16,7 @@ from haltere.report.context import Context, Episode, sensor_label
 from haltere.report.series import Pool
 
 __all__ = [
-    "Verdict", "count", "diagnosis_in_words", "discarded", "facts", "fixed", "named_faults", "nis_in_words", "number", "verdict",
+    "Verdict", "count", "diagnosis_in_words", "discarded", "facts", "fixed", "nis_in_words", "number", "verdict",
     "verdict_of", "whiteness_in_words", "wind_in_words",
 ]  # fmt: skip
 
@@ -85,7 +85,7 @@ def verdict(c: Context) -> Verdict:
     ill = list(dict.fromkeys(_unit_label(f) for f in found if base_name(f["stream"]) == f["stream"]))  # further units are not used
     compass = disturbances(solution.events)
     alone = compass and by_level["bad"] == ["magnetometer"] and not by_level["doubtful"] and compass[0]["t_onset"] > solution.t[0] + 2.0
-    failed = named_faults(solution.events)
+    failed = _named_faults(solution.events)
     driven = [e for e in solution.events if e["sensor"] == "rotors" and e.get("candidates")]
     doubtful = by_level["doubtful"] or lost or drifting or torn or ill or alone or failed
     worst = 2 if (by_level["bad"] and not alone) or broken else 1 if doubtful else 0
@@ -134,10 +134,15 @@ _OF_THE_MODEL = {
 }  # fmt: skip
 
 
-def named_faults(events: list[dict[str, Any]]) -> list[tuple[float, str]]:
+#: What a vehicle is said to do whose motion is not that of its rotors.
+_DRIVEN = "motion that is not what the rotors should make"
+
+
+def _named_faults(events: list[dict[str, Any]]) -> list[tuple[float, str]]:
     """Onset [s] and name of every part that was found to fail, in order of time: a part that failed before is not said again.
 
-    A compass that was disturbed is one of them where something else failed, too: alone it is no fault of the compass.
+    A compass that was disturbed, and motion that is not the rotors', are among them where a part failed, too: alone they have headlines of
+    their own.
     """
     found: dict[str, float] = {}
     compass = disturbances(events)
@@ -145,21 +150,26 @@ def named_faults(events: list[dict[str, Any]]) -> list[tuple[float, str]]:
         sensor, axis = e["sensor"], str(e.get("axis") or "")
         if sensor in ("gyro", "accel", "gnss", "barometer") and e["t_isolated"] is not None:
             name = f"{'accelerometer' if sensor == 'accel' else sensor_label(sensor)} {_AXES.get(axis, axis)}".strip()
+            unit = (e.get("candidates") or [""])[0].split(".")
+            if len(unit) == 4:  # of a further IMU, which was not used
+                name += f" of {unit[0]}.{unit[1]}"
         elif sensor == "rotors" and e["kind"] == "thrust" and e["t_isolated"] is not None:
             name = f"rotor {axis} or its tachometer"
         elif sensor == "model" and e["t_isolated"] is not None:
             name = f"{_OF_THE_MODEL[axis]} that the vehicle's model lacks"
+        elif sensor == "rotors" and not axis and e.get("candidates"):
+            name = _DRIVEN
         elif sensor == "magnetometer" and e in compass:
             name = "compass"
         else:
             continue
         found.setdefault(name, float(e["t_onset"]))
-    return [] if list(found) == ["compass"] else [(t, name) for name, t in found.items()]
+    return [(t, name) for name, t in found.items()] if set(found) - {"compass", _DRIVEN} else []
 
 
 def _failed(found: list[tuple[float, str]]) -> str:
     """The headline for parts that failed."""
-    inertial = [name for _, name in found if name.startswith(("gyro", "accelerometer"))]
+    inertial = [name for _, name in found if name.startswith(("gyro", "accelerometer")) and " of " not in name]
     healed = f"; {'its effect was' if len(inertial) == 1 else 'their effects were'} taken back as far as it is known" if inertial else ""
     if len(inertial) == len(found):
         return f"An inertial sensor failed: {_list(inertial)}, first at t = {found[0][0]:.1f} s{healed}."
